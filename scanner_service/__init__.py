@@ -1,0 +1,1 @@
+"""Live quality for laser-line scanning: what was measured, how well, and what to scan again."""

@@ -1,0 +1,95 @@
+"""The stored truth: a scanline's coordinates, quantised once; knows no map, no database and no clock.
+
+Coordinates become int32 multiples of `QUANTUM_MM` = 2**-13 mm from the session's origin. What leaves here is what
+is stored, analysed, exported and replayed, so every floor above computes from the same integers.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.scanline import Float64Array, Scanline, read_only
+
+QUANTUM_MM = 2.0**-13
+_LIMIT_Q = 2**31 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class StoredLine:
+    """One scanline as it is stored: integer coordinates and everything needed to analyse it again.
+
+    `xyz_q` (k, 3) int32 are multiples of QUANTUM_MM from the session's origin, in the order of the line;
+    `index` (k,) int32 is each point's place in the line of `point_count` places. Places without a point are
+    counted by reason in `dropped`: `dropout` (no return), `missing` (its chunk never arrived), `not_finite`
+    (half a coordinate, or infinite), `out_of_bounds` (beyond +-262 m of the origin); so
+    `point_count == len(index) + sum(dropped.values())`. The vectors are (3,) float64 in the part frame.
+    """
+
+    device_id: str
+    boot_id: int
+    pass_index: int
+    line_index: int
+    device_time_s: float
+    xyz_q: npt.NDArray[np.int32]
+    index: npt.NDArray[np.int32]
+    point_count: int
+    laser_mm: Float64Array
+    plane_normal: Float64Array
+    travel: Float64Array
+    position_mm: float
+    line_spacing_mm: float
+    step_mm: float
+    dropped: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for array in (self.xyz_q, self.index, self.laser_mm, self.plane_normal, self.travel):
+            read_only(array)
+
+
+def quantise(line: Scanline, origin_mm: Float64Array) -> StoredLine:
+    """Quantise a scanline to the stored truth; nothing is clamped, what cannot be kept is counted by reason.
+
+    Parameters
+    ----------
+    line : the scanline, part frame, millimetres.
+    origin_mm : (3,) the session's origin in the part frame.
+
+    Raises
+    ------
+    ValueError : when the line spacing is not a positive finite number, or the laser position is not finite.
+    """
+    if not (np.isfinite(line.line_spacing_mm) and line.line_spacing_mm > 0):
+        raise ValueError(f"line spacing must be greater than 0 mm, not {line.line_spacing_mm}")
+    if not np.isfinite(line.laser_mm).all():
+        raise ValueError(f"laser position must be three finite millimetres, not {line.laser_mm.tolist()}")
+    points = line.points_mm
+    is_nan = np.isnan(points).all(axis=1)
+    finite = np.isfinite(points).all(axis=1) & ~line.missing
+    with np.errstate(invalid="ignore", over="ignore"):
+        scaled = np.rint((points - origin_mm) / QUANTUM_MM)
+        inside = (np.abs(scaled) <= _LIMIT_Q).all(axis=1)
+    kept = finite & inside
+    dropped = {
+        "dropout": int((is_nan & ~line.missing).sum()),
+        "missing": int(line.missing.sum()),
+        "not_finite": int((~finite & ~is_nan & ~line.missing).sum()),
+        "out_of_bounds": int((finite & ~inside).sum()),
+    }
+    return StoredLine(
+        device_id=line.device_id,
+        boot_id=line.boot_id,
+        pass_index=line.pass_index,
+        line_index=line.line_index,
+        device_time_s=line.device_time_s,
+        xyz_q=scaled[kept].astype(np.int32),
+        index=np.flatnonzero(kept).astype(np.int32),
+        point_count=len(points),
+        laser_mm=np.array(line.laser_mm, dtype=np.float64),
+        plane_normal=np.array(line.plane_normal, dtype=np.float64),
+        travel=np.array(line.travel, dtype=np.float64),
+        position_mm=float(line.position_mm),
+        line_spacing_mm=float(line.line_spacing_mm),
+        step_mm=float(line.step_mm),
+        dropped={reason: count for reason, count in dropped.items() if count},
+    )

@@ -1,0 +1,1 @@
+"""REST and WebSocket: routers that translate requests and answers, and decide nothing."""

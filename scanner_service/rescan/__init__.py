@@ -1,0 +1,1 @@
+"""What to scan again and why: pure functions of a map snapshot."""

@@ -1,0 +1,1 @@
+"""The device's half of each protocol: bytes in, bytes out, time passed in."""
