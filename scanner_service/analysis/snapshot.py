@@ -70,7 +70,7 @@ class MapSnapshot:
     Eq. 6.4, the point itself counted; 0 for points that are not counted. `density_per_mm2` = Np / (pi r^2).
     `normals` (n, 3) are unit, turned to the scanline's own laser position, NaN where `unreliable` is not 0.
     `offset` is |centroid - p| / r of the neighbourhood, 0 in the middle of a surface, about 0.42 at a straight border.
-    `residual_mm` is sqrt(lambda3 / (Np - 3)), NaN below 4 points; `normal_error_rad` the predicted error, NaN if unknown.
+    `residual_mm` is sqrt(lambda3 / (Np - 3)), NaN below 4 points; `normal_error_rad` the predicted error or NaN.
     """
 
     version: int
