@@ -1,0 +1,68 @@
+"""The radius rules of the chapter, as pure functions of spacings and points; knows no map."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.scanline import Float64Array
+from scanner_service.analysis.intake import QUANTUM_MM
+from scanner_service.analysis.snapshot import RadiusRule
+
+MIN_GAPS = 10
+"""A line's median point spacing is trusted from this many gaps on; below, the line spacing governs alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class RadiusSettings:
+    """Which radius a scanline's points get.
+
+    `uncertainty_mm` is the constant c of Eq. 6.3 (0.1 mm by default). `point_spacing_mm` says how far apart the points
+    of a line are: None measures it in each line, a number states it for all, and 0 ignores it (plain Eq. 6.3).
+    """
+
+    uncertainty_mm: float = 0.1
+    point_spacing_mm: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.uncertainty_mm) and self.uncertainty_mm >= 0):
+            raise ValueError(f"the constant c must be 0 mm or more, not {self.uncertainty_mm}")
+        if self.point_spacing_mm is not None and not 0 <= self.point_spacing_mm < math.inf:
+            raise ValueError(f"the point spacing must be 0 mm or more, not {self.point_spacing_mm}")
+
+
+def point_spacing_mm(xyz_q: npt.NDArray[np.int32], index: npt.NDArray[np.int32]) -> float:
+    """Median distance in mm of points that are next to each other in a line; NaN with fewer than MIN_GAPS gaps.
+
+    `xyz_q` (k, 3) are stored coordinates, `index` (k,) their places; pairs with a dropout between them do not count.
+    """
+    adjacent = np.diff(index) == 1
+    if int(adjacent.sum()) < MIN_GAPS:
+        return math.nan
+    steps = np.diff(xyz_q.astype(np.float64), axis=0)[adjacent]
+    return float(np.median(np.sqrt((steps * steps).sum(axis=1)))) * QUANTUM_MM
+
+
+def line_radius(line_spacing_mm: float, measured_mm: float, settings: RadiusSettings) -> tuple[float, RadiusRule]:
+    """r_min = sqrt(2) * max(line spacing, point spacing) + c, in mm, and which of the two spacings governed.
+
+    Eq. 6.3 of the chapter presumes points at least as close along the line as the lines are to each other; where they
+    are not, the larger spacing governs. `measured_mm` is the line's own point spacing (NaN: unknown).
+
+    Raises
+    ------
+    ValueError : when the line spacing is not a positive finite number.
+    """
+    if not (math.isfinite(line_spacing_mm) and line_spacing_mm > 0):
+        raise ValueError(f"line spacing must be greater than 0 mm, not {line_spacing_mm}")
+    spacing = measured_mm if settings.point_spacing_mm is None else settings.point_spacing_mm
+    governs = spacing > line_spacing_mm
+    governing = spacing if governs else line_spacing_mm
+    rule = RadiusRule.POINT_SPACING if governs else RadiusRule.LINE_SPACING
+    return math.sqrt(2.0) * governing + settings.uncertainty_mm, rule
+
+
+def radius_squared_q(radius_mm: Float64Array) -> npt.NDArray[np.int64]:
+    """floor((r / q)^2): two stored points are neighbours when their squared integer distance is at most this."""
+    return np.floor((radius_mm / QUANTUM_MM) ** 2).astype(np.int64)
