@@ -1,0 +1,286 @@
+"""What may be done inside one transaction of the writer; knows no thread, no retry and no file.
+
+Every method looks before it writes: a `RecordError` from it has changed nothing. The state a batch builds on
+(`Tail`) is copied at first touch and handed back only when the batch is durable.
+"""
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sqlalchemy import Connection, delete, func, insert, select, update
+
+from scanner_service.analysis.intake import StoredLine
+from scanner_service.storage.encoding import encode_line
+from scanner_service.storage.errors import SessionDamaged, SessionUnknown
+from scanner_service.storage.rows import EventRow, SessionRow, Stored, Watermark
+from scanner_service.storage.tables import (
+    events,
+    from_json,
+    lines,
+    plain_text,
+    record,
+    row_crc,
+    sessions,
+    to_json,
+    values_crc,
+)
+
+DELETE_SLICE_LINES = 256
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedLine:
+    """A line ready to be stored, made in the thread of the caller."""
+
+    device_id: str
+    boot_id: int
+    line_index: int
+    pass_index: int
+    points: int
+    encoded: bytes
+    encoded_crc32: int
+
+    @classmethod
+    def of(cls, line: StoredLine) -> "EncodedLine":
+        """Encode a line; raises NotStorable."""
+        encoded = encode_line(line)
+        key = (plain_text(line.device_id, "device id"), line.boot_id, line.line_index, line.pass_index)
+        return cls(*key, len(line.index), encoded, zlib.crc32(encoded))
+
+
+@dataclass(slots=True)
+class Tail:
+    """Where a session ends: the next numbers, and per device and boot (in order of arrival) how far it got."""
+
+    next_line: int = 0
+    points: int = 0
+    next_event: int = 0
+    marks: dict[tuple[str, int], Watermark] = field(default_factory=dict)
+    latest_boot: dict[str, int] = field(default_factory=dict)
+
+    def copy(self) -> "Tail":
+        """A tail of its own, so that a failed batch leaves this one as it was."""
+        return replace(self, marks=dict(self.marks), latest_boot=dict(self.latest_boot))
+
+    def watermarks(self) -> dict[str, Watermark]:
+        """Of each device, the watermark of the boot whose line was stored last."""
+        return {device: self.marks[device, boot] for device, boot in self.latest_boot.items()}
+
+    def advance(self, line: EncodedLine) -> None:
+        """Account for one more line."""
+        key = (line.device_id, line.boot_id)
+        mark = self.marks.get(key, Watermark(line.boot_id, line.line_index, line.line_index, 0))
+        highest, first = max(mark.line_index, line.line_index), min(mark.first_index, line.line_index)
+        self.marks[key] = Watermark(line.boot_id, highest, first, mark.line_count + 1)
+        self.latest_boot[line.device_id] = line.boot_id
+        self.next_line += 1
+        self.points += line.points
+
+
+def load_tail(connection: Connection, session_id: str) -> Tail:
+    """Where a session ends, read from the record."""
+    of_session = lines.c.session_id == session_id
+    last = connection.execute(
+        select(lines.c.line_number, lines.c.points, lines.c.points_before)
+        .where(of_session)
+        .order_by(lines.c.line_number.desc())
+        .limit(1)
+    ).first()
+    next_event = select(func.coalesce(func.max(events.c.number) + 1, 0)).where(events.c.session_id == session_id)
+    tail = Tail(next_event=connection.execute(next_event).scalar_one())
+    if last is not None:
+        tail.next_line, tail.points = last.line_number + 1, last.points_before + last.points
+    index = lines.c.line_index
+    boots = connection.execute(
+        select(lines.c.device_id, lines.c.boot_id, func.max(index), func.min(index), func.count())
+        .where(of_session)
+        .group_by(lines.c.device_id, lines.c.boot_id)
+        .order_by(func.max(lines.c.line_number))
+    )
+    for device, boot, highest, first, count in boots:
+        tail.marks[device, boot] = Watermark(boot, highest, first, count)
+        tail.latest_boot[device] = boot
+    return tail
+
+
+class Batch:
+    """One transaction: jobs call its methods in order, then `finish` writes what was put off."""
+
+    def __init__(self, connection: Connection, known: Mapping[str, Tail]) -> None:
+        self._connection = connection
+        self._known = known
+        self._rows: list[dict[str, Any]] = []
+        self.tails: dict[str, Tail] = {}
+        self.deleted: set[str] = set()
+
+    def append_line(self, session_id: str, line: EncodedLine) -> Stored:
+        """Store a line, unless it, or another under its key, is there already."""
+        tail = self._tail(session_id)
+        mark = tail.marks.get((line.device_id, line.boot_id))
+        if mark is not None and mark.first_index <= line.line_index <= mark.line_index:
+            found = self._find(session_id, line)
+            if found is not None:
+                return found
+        row = {
+            "session_id": session_id,
+            "line_number": tail.next_line,
+            "device_id": line.device_id,
+            "boot_id": line.boot_id,
+            "line_index": line.line_index,
+            "pass_index": line.pass_index,
+            "points": line.points,
+            "points_before": tail.points,
+        }
+        crc = values_crc({**row, "encoded": line.encoded_crc32})
+        self._rows.append({**row, "crc32": crc, "encoded": line.encoded})
+        tail.advance(line)
+        return Stored(tail.next_line - 1, "stored")
+
+    def append_event(self, session_id: str, time_utc: str, kind: str, details: Mapping[str, Any]) -> EventRow:
+        """Store an event, numbered within its session."""
+        tail = self._tail(session_id)
+        event = EventRow(session_id, tail.next_event, time_utc, kind, tail.next_line, details)
+        row = {
+            "session_id": session_id,
+            "number": event.number,
+            "time_utc": time_utc,
+            "kind": kind,
+            "line_number": event.line_number,
+            "details": to_json(details, "details of the event"),
+        }
+        self._connection.execute(insert(events).values(row | {"crc32": row_crc(row)}))
+        tail.next_event += 1
+        return event
+
+    def newest_session_id(self) -> str | None:
+        """The greatest id of any session, deleted or not."""
+        newest: str | None = self._connection.execute(select(func.max(sessions.c.session_id))).scalar()
+        return newest
+
+    def create_session(self, session: SessionRow) -> SessionRow:
+        """Store a session."""
+        x_mm, y_mm, z_mm = session.origin_mm
+        row = {
+            "session_id": session.session_id,
+            "name": session.name,
+            "created_utc": session.created_utc,
+            "changed_utc": session.changed_utc,
+            "state": session.state,
+            "settings": to_json(session.settings, "settings"),
+            "origin_x_mm": x_mm,
+            "origin_y_mm": y_mm,
+            "origin_z_mm": z_mm,
+            "source": to_json(session.source, "source"),
+            "deleted_utc": "",
+        }
+        self._connection.execute(insert(sessions).values(row | {"crc32": row_crc(row)}))
+        self.tails[session.session_id] = Tail()
+        return session
+
+    def set_state(self, session_id: str, state: str, now_utc: str) -> SessionRow:
+        """Change a session's state."""
+        row = self._session(session_id)
+        if row.pop("crc32") != row_crc(row):
+            raise SessionDamaged(f"session {session_id} fails its checksum and is not changed; its lines are readable")
+        row |= {"state": state, "changed_utc": now_utc}
+        self._update(session_id, row)
+        return session_from(row | {"crc32": row_crc(row)})
+
+    def delete_session(self, session_id: str, now_utc: str) -> None:
+        """Hide a session from now on; `delete_slice` takes its rows away, a bounded number at a time."""
+        row = self._session(session_id)
+        row.pop("crc32")
+        self._update(session_id, row | {"deleted_utc": now_utc})
+        self.deleted.add(session_id)
+
+    def delete_slice(self, session_id: str) -> bool:
+        """Delete some lines of a deleted session, and the session itself once it has none; True when it is gone."""
+        self.finish()
+        of_session = lines.c.session_id == session_id
+        first = self._connection.execute(select(func.min(lines.c.line_number)).where(of_session)).scalar()
+        if first is not None:
+            in_slice = lines.c.line_number < first + DELETE_SLICE_LINES
+            self._connection.execute(delete(lines).where(of_session, in_slice))
+            return False
+        self._connection.execute(delete(events).where(events.c.session_id == session_id))
+        self._connection.execute(delete(sessions).where(sessions.c.session_id == session_id))
+        return True
+
+    def finish(self) -> None:
+        """Write the lines of the batch in one statement."""
+        if self._rows:
+            self._connection.execute(insert(lines), self._rows)
+            self._rows = []
+
+    def _find(self, session_id: str, line: EncodedLine) -> Stored | None:
+        """The answer for a line whose key is taken, None when it is free."""
+        self.finish()
+        found = self._connection.execute(
+            select(lines).where(
+                lines.c.session_id == session_id,
+                lines.c.device_id == line.device_id,
+                lines.c.boot_id == line.boot_id,
+                lines.c.line_index == line.line_index,
+            )
+        ).first()
+        if found is None:
+            return None
+        row = found._asdict()
+        same = row.pop("crc32") == row_crc(row) and row["encoded"] == line.encoded
+        return Stored(row["line_number"], "duplicate" if same else "conflict")
+
+    def _tail(self, session_id: str) -> Tail:
+        if session_id in self.deleted:
+            raise SessionUnknown(f"there is no session {session_id}")
+        tail = self.tails.get(session_id)
+        if tail is None:
+            known = self._known.get(session_id)
+            if known is None:
+                self._session(session_id)
+                known = load_tail(self._connection, session_id)
+            tail = self.tails[session_id] = known.copy()
+        return tail
+
+    def _session(self, session_id: str) -> dict[str, Any]:
+        query = select(sessions).where(sessions.c.session_id == session_id, sessions.c.deleted_utc == "")
+        row = self._connection.execute(query).first()
+        if row is None or session_id in self.deleted:
+            raise SessionUnknown(f"there is no session {session_id}")
+        return row._asdict()
+
+    def _update(self, session_id: str, row: dict[str, Any]) -> None:
+        values = row | {"crc32": row_crc(row)}
+        self._connection.execute(update(sessions).where(sessions.c.session_id == session_id).values(values))
+
+
+def session_from(row: Mapping[str, Any]) -> SessionRow:
+    """A row of the table as a value; what cannot be read of a damaged row is left empty."""
+    settings, source = from_json(row["settings"]), from_json(row["source"])
+    return SessionRow(
+        session_id=_legible(row["session_id"]),
+        name=_legible(row["name"]),
+        created_utc=_legible(row["created_utc"]),
+        changed_utc=_legible(row["changed_utc"]),
+        state=_legible(row["state"]),
+        settings=settings or {},
+        origin_mm=(row["origin_x_mm"], row["origin_y_mm"], row["origin_z_mm"]),
+        source=source or {},
+        damaged=row["crc32"] != row_crc(row) or settings is None or source is None,
+    )
+
+
+def _legible(text: Any) -> str:
+    """Text that anybody can print, also when its bytes were damaged."""
+    return str(text).encode("utf-8", "replace").decode()
+
+
+def batch_number(connection: Connection) -> int:
+    """The number of the last batch that is in the record."""
+    return int(connection.execute(select(record.c.batch_number)).scalar_one())
+
+
+def set_batch_number(connection: Connection, number: int) -> None:
+    """Write the number of this batch, so that a later look tells whether it is in."""
+    connection.execute(update(record).values(batch_number=number))

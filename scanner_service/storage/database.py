@@ -1,0 +1,229 @@
+"""The record's SQLite file: its lock, its making, its checks and its connections; knows no session and no line."""
+
+import contextlib
+import fcntl
+import os
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Engine, create_engine, event, insert
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.pool import NullPool, QueuePool
+
+from scanner_service.storage.errors import NotARecord, RecordInUse, RecordNotWritable, RecordTooNew, SqliteTooOld
+from scanner_service.storage.tables import APPLICATION_ID, SCHEMA_VERSION, metadata, record
+
+OLDEST_SQLITE = (3, 37, 0)
+PAGE_BYTES = 8192
+_WRITER_WAITS_S = 0.2
+_READER_WAITS_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class SqliteLibrary:
+    """The SQLite in use. `wal_reset_bug`: two connections that write or checkpoint at once may corrupt the file.
+
+    3.7.0 to 3.51.2 have it, but for 3.44.6 and 3.50.7 and later of their lines. Such a library is accepted, because
+    here one connection alone writes and checkpoints (`docs/record.md`).
+    """
+
+    version: tuple[int, int, int]
+
+    @property
+    def wal_reset_bug(self) -> bool:
+        """True when the library has the defect."""
+        mended = {44: 6, 50: 7}
+        minor, patch = self.version[1:]
+        return (3, 7, 0) <= self.version < (3, 51, 3) and not (minor in mended and patch >= mended[minor])
+
+
+def sqlite_library() -> SqliteLibrary:
+    """The SQLite library of this Python.
+
+    Raises
+    ------
+    SqliteTooOld : when it is older than the record was ever tried with.
+    """
+    major, minor, patch = sqlite3.sqlite_version_info[:3]
+    if (major, minor, patch) < OLDEST_SQLITE:
+        oldest = ".".join(map(str, OLDEST_SQLITE))
+        raise SqliteTooOld(f"this Python has SQLite {sqlite3.sqlite_version}; the record needs {oldest} or newer")
+    return SqliteLibrary((major, minor, patch))
+
+
+class RecordLock:
+    """An exclusive flock on a file beside the record, held while the record is open, gone with the process."""
+
+    def __init__(self, record_path: Path) -> None:
+        self._path = record_path.with_name(record_path.name + ".lock")
+        self._descriptor = self._acquire()
+
+    def _acquire(self) -> int:
+        while True:
+            descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                same = os.path.samestat(os.fstat(descriptor), self._path.stat())
+            except BlockingIOError as error:
+                holder = os.read(descriptor, 32).decode("ascii", "replace").strip() or "unknown"
+                os.close(descriptor)
+                raise RecordInUse(
+                    f"the record is in use by another service (process {holder}); stop it, or choose another record"
+                ) from error
+            except FileNotFoundError:
+                same = False
+            if same:
+                os.truncate(descriptor, 0)
+                os.write(descriptor, f"{os.getpid()}\n".encode())
+                return descriptor
+            os.close(descriptor)  # its last holder removed the file between our open and our lock: take the new one
+
+    def release(self) -> None:
+        """Remove the file while the lock is still held, so that nobody can lock a file that is on its way out."""
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+        os.close(self._descriptor)
+
+
+@contextlib.contextmanager
+def writable(path: Path) -> Iterator[None]:
+    """Translate what the operating system says of a place that cannot be written to."""
+    try:
+        yield
+    except OSError as error:
+        raise RecordNotWritable(f"the record {path} cannot be written: {error.strerror}") from error
+
+
+def check_place(path: Path) -> None:
+    """Refuse, before anything is touched, a place that cannot hold the record.
+
+    Raises
+    ------
+    RecordNotWritable : a folder, a missing folder, or a file that may not be written.
+    """
+    if path.is_dir():
+        raise RecordNotWritable(f"{path} is a folder; the record must be a file in it")
+    if not path.parent.is_dir():
+        raise RecordNotWritable(f"there is no folder {path.parent} for the record; create it first")
+    if path.exists() and not path.is_file():
+        raise RecordNotWritable(f"{path} is no ordinary file; the record must be one")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise RecordNotWritable(f"the record {path} may not be written; check its owner and whether the disk is")
+
+
+def check_identity(connection: sqlite3.Connection, path: Path) -> None:
+    """Refuse a file that is not a record, or not one this version knows.
+
+    Raises
+    ------
+    NotARecord, RecordTooNew
+    """
+    try:
+        application = connection.execute("PRAGMA application_id").fetchone()[0]
+        version = connection.execute("PRAGMA user_version").fetchone()[0]
+    except sqlite3.DatabaseError as error:
+        raise NotARecord(f"{path} is not a record of this service: {error}; choose another file") from error
+    if application != APPLICATION_ID:
+        raise NotARecord(f"{path} is not a record of this service; choose another file")
+    if version > SCHEMA_VERSION:
+        raise RecordTooNew(
+            f"{path} was written by a newer version (schema {version}, this one knows {SCHEMA_VERSION}); update first"
+        )
+
+
+def check_file(path: Path) -> None:
+    """Check the identity of a file without touching it or anything beside it."""
+    try:
+        connection = sqlite3.connect(f"{path.as_uri()}?mode=ro&immutable=1", uri=True)
+    except sqlite3.Error as error:
+        raise NotARecord(f"{path} cannot be opened as a record: {error}") from error
+    with contextlib.closing(connection):
+        check_identity(connection, path)
+
+
+def create_file(path: Path, created_utc: str) -> None:
+    """Make an empty record beside `path` and rename it when it is whole and synced."""
+    unfinished = path.with_name(path.name + ".new")
+    for leftover in (unfinished, unfinished.with_name(unfinished.name + "-journal")):
+        leftover.unlink(missing_ok=True)
+    engine = create_engine("sqlite://", creator=lambda: sqlite3.connect(unfinished), poolclass=NullPool)
+    try:
+        with engine.begin() as connection:
+            for pragma in (f"page_size={PAGE_BYTES}", "synchronous=EXTRA"):
+                connection.exec_driver_sql(f"PRAGMA {pragma}")
+            metadata.create_all(connection)
+            row = {"id": 1, "schema_version": SCHEMA_VERSION, "created_utc": created_utc, "batch_number": 0}
+            connection.execute(insert(record).values(row))
+            for pragma in (f"application_id={APPLICATION_ID}", f"user_version={SCHEMA_VERSION}"):
+                connection.exec_driver_sql(f"PRAGMA {pragma}")
+    except DBAPIError as error:
+        unfinished.unlink(missing_ok=True)
+        raise RecordNotWritable(f"the record {path} cannot be made: {error.orig}") from error
+    unfinished.rename(path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def writer_engine(path: Path, factory: type[sqlite3.Connection]) -> Engine:
+    """An engine for the one connection that writes: WAL, FULL, every transaction immediate, checkpoints by hand."""
+
+    def connect() -> sqlite3.Connection:
+        connection = _connect(path, "rw", _WRITER_WAITS_S, factory)
+        try:
+            check_identity(connection, path)
+            for pragma in ("journal_mode=WAL", "synchronous=FULL", "fullfsync=1", "wal_autocheckpoint=0"):
+                connection.execute(f"PRAGMA {pragma}")
+            for pragma in ("checkpoint_fullfsync=1", "foreign_keys=1", "secure_delete=0", "mmap_size=0"):
+                connection.execute(f"PRAGMA {pragma}")
+            if connection.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
+                raise sqlite3.OperationalError("this disk does not support SQLite's write-ahead log")
+        except BaseException:
+            connection.close()
+            raise
+        return connection
+
+    engine = create_engine("sqlite://", creator=connect, poolclass=NullPool)
+    event.listen(engine, "begin", lambda connection: connection.exec_driver_sql("BEGIN IMMEDIATE"))
+    return engine
+
+
+def reader_engine(path: Path) -> Engine:
+    """An engine whose connections can neither write nor checkpoint."""
+
+    def connect() -> sqlite3.Connection:
+        connection = _connect(path, "ro", _READER_WAITS_S, sqlite3.Connection)
+        connection.execute("PRAGMA query_only=1")
+        connection.execute("PRAGMA mmap_size=0")
+        return connection
+
+    return create_engine("sqlite://", creator=connect, poolclass=QueuePool, pool_size=4, max_overflow=28)
+
+
+def checkpoint(connection: sqlite3.Connection, mode: str) -> tuple[int, int]:
+    """Copy the write-ahead log into the file; the frames in the log, and how many of them are copied."""
+    _, frames, copied = connection.execute(f"PRAGMA wal_checkpoint({mode})").fetchone()
+    return int(frames), int(copied)
+
+
+def _connect(path: Path, mode: str, waits_s: float, factory: type[sqlite3.Connection]) -> sqlite3.Connection:
+    connection = sqlite3.connect(
+        f"{path.as_uri()}?mode={mode}",
+        uri=True,
+        timeout=waits_s,
+        isolation_level=None,
+        check_same_thread=False,
+        factory=factory,
+    )
+    connection.text_factory = _text
+    return connection
+
+
+def _text(raw: bytes) -> Any:
+    """Text whose bytes were flipped must reach the checksum, not stop the reader."""
+    return raw.decode("utf-8", "surrogateescape")
