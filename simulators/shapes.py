@@ -113,13 +113,14 @@ class Polyhedron(ConvexSolid):
 
     def interval(self, origins_mm: Float64Array, directions: Float64Array) -> tuple[Float64Array, Float64Array]:
         """Between the last face entered and the first face left."""
-        rise = directions @ self._normals.T
-        room = self._offsets - origins_mm @ self._normals.T
+        # One row a face: numpy reduces long rows several times faster than short ones.
+        rise = self._normals @ directions.T
+        room = self._offsets[:, None] - self._normals @ origins_mm.T
         with np.errstate(divide="ignore", invalid="ignore"):
             at = room / rise
-        enter = np.where(rise < 0, at, -np.inf).max(axis=1)
-        leave = np.where(rise > 0, at, np.inf).min(axis=1)
-        beside = ((rise == 0) & (room < 0)).any(axis=1)
+        enter = np.where(rise < 0, at, -np.inf).max(axis=0)
+        leave = np.where(rise > 0, at, np.inf).min(axis=0)
+        beside = ((rise == 0) & (room < 0)).any(axis=0)
         return enter, np.where(beside, -np.inf, leave)
 
     def outward(self, points_mm: Float64Array) -> Float64Array:
