@@ -1,0 +1,81 @@
+"""Where scanner, stage and part stand to each other: profiles and stage positions become scanlines; knows no device."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drivers.errors import PositionUnknown
+from drivers.scanline import Float64Array, Pose, Profile, Scanline, read_only
+
+
+def _along_y() -> Float64Array:
+    return np.array([0.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """A sensor on a stage before a part; the default mounts everything alike, so that part = (x, position, z).
+
+    At stage position s the sensor stands at `part_from_stage @ shift(s * travel_stage) @ stage_from_sensor`.
+    `travel_stage` (3,) is a unit vector in the stage frame: where the sensor goes, seen from the part, as s grows. A
+    rig whose part moves instead has the opposite vector.
+    """
+
+    part_from_stage: Pose = field(default_factory=Pose.identity)
+    stage_from_sensor: Pose = field(default_factory=Pose.identity)
+    travel_stage: Float64Array = field(default_factory=_along_y)
+
+    def __post_init__(self) -> None:
+        if self.travel_stage.shape != (3,) or not abs(float(np.linalg.norm(self.travel_stage)) - 1) < 1e-6:
+            raise ValueError(f"travel_stage must be a unit vector (3,), not {np.asarray(self.travel_stage).tolist()}")
+        read_only(self.travel_stage)
+
+    def part_from_sensor(self, position_mm: float) -> Pose:
+        """Return the sensor's pose at a stage position."""
+        shift = Pose(np.eye(3), position_mm * self.travel_stage)
+        return self.part_from_stage @ shift @ self.stage_from_sensor
+
+    def place(self, profile: Profile, position_mm: float | None = None) -> Scanline:
+        """Return the profile in the part frame.
+
+        Parameters
+        ----------
+        profile : in the sensor frame, where the laser plane is y = 0.
+        position_mm : stage position, if it is not to be the profile's own.
+
+        Notes
+        -----
+        The normal of the laser plane is the sensor's y axis, turned so that it agrees with the travel. The travel is
+        the direction in which the positions grow; a pass that runs backwards has negative steps.
+
+        Raises
+        ------
+        PositionUnknown : when neither the profile nor the caller knows the stage position.
+        """
+        at_mm = profile.position_mm if position_mm is None else position_mm
+        if not np.isfinite(at_mm):
+            raise PositionUnknown(
+                f"line {profile.line_index} of {profile.device_id} has no stage position; connect the encoder to the "
+                "scanner, or give a position for each line"
+            )
+        part_from_sensor = self.part_from_sensor(at_mm)
+        points_mm = np.stack([profile.x_mm, np.zeros_like(profile.x_mm), profile.z_mm], axis=1)
+        no_return = np.isnan(profile.x_mm) | np.isnan(profile.z_mm)
+        points_mm[no_return] = np.nan
+        travel = self.part_from_stage.rotate(self.travel_stage)
+        normal = part_from_sensor.rotate(np.array([0.0, 1.0, 0.0]))
+        return Scanline(
+            device_id=profile.device_id,
+            boot_id=profile.boot_id,
+            pass_index=profile.pass_index,
+            line_index=profile.line_index,
+            device_time_s=profile.device_time_s,
+            points_mm=part_from_sensor.apply(points_mm),
+            missing=profile.missing,
+            laser_mm=part_from_sensor.apply(profile.laser_mm),
+            plane_normal=-normal if float(normal @ travel) < 0 else normal,
+            travel=travel,
+            position_mm=float(at_mm),
+            line_spacing_mm=profile.line_spacing_mm,
+            step_mm=profile.step_mm,
+        )

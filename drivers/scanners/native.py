@@ -1,0 +1,344 @@
+"""A scanner that speaks the native protocol, on a serial port: enter, start, events, exit; decides no policy.
+
+The conversation itself is `drivers.protocols.native_host`, which knows no port; here are the port, the thread that
+reads it, and the bounded queue between that thread and whoever wants the lines.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self, TypeAlias
+
+from drivers.errors import (
+    DriverError,
+    PortError,
+    PortStalled,
+    ProtocolUnsupported,
+    ScannerNotConnected,
+    ScannerRefused,
+    ScannerSilent,
+    ScannerTimeout,
+)
+from drivers.port import Port
+from drivers.protocols.native_host import NativeHost, Phase
+from drivers.protocols.native_messages import PROTOCOL_VERSION
+from drivers.protocols.native_requests import PassPlan, Request, describe_failure
+from drivers.protocols.scanner_events import ScannerEvent
+from drivers.scanline import DeviceInfo, Profile
+from drivers.tally import Tally
+
+Happening: TypeAlias = Profile | ScannerEvent
+
+_READ_S = 0.02
+_REOPEN_S = 0.1
+_ENTER_S = 6.0
+_STALL_S = 1.0
+_EXIT_S = 1.0
+_END_S = 5.0
+_MAX_EVENTS = 1_000
+
+
+class NativeScanner:
+    """One scanner on one port.
+
+    A thread of its own reads, stamps and parses, and never waits for anybody: when `queue_lines` lines have not been
+    fetched, further ones are lost and counted as `host_overflow`. The thread also holds the device's dead-man off while
+    a pass is on or the laser was switched on, and reopens a lost port about every 0.1 s.
+
+    Parameters
+    ----------
+    port_path : the tty, an absolute path; links such as those in /dev/serial/by-id are followed anew at each opening.
+    baud_rate : bits per second.
+    clock : seconds that never run backwards; it stamps the arrival of lines.
+    queue_lines : lines that may wait to be fetched by `events`.
+    """
+
+    def __init__(
+        self,
+        port_path: str,
+        baud_rate: int,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        queue_lines: int = 4096,
+    ) -> None:
+        self._path = port_path
+        self._baud_rate = baud_rate
+        self._clock = clock
+        self._queue_lines = queue_lines
+        self._changed = threading.Condition()  # guards everything below except the port, which is the thread's
+        self._host = NativeHost(self._deliver, self._tell)
+        self._queue: deque[Happening] = deque()
+        self._lines_waiting = 0
+        self._skipped_events = 0
+        self._failure: Exception | None = None
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> Self:
+        self.enter()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.exit()
+
+    def enter(self) -> DeviceInfo:
+        """Open the port, stop whatever an earlier program left running, and ask who is there.
+
+        Raises
+        ------
+        PortError : when the port cannot be opened, or is lost meanwhile.
+        ScannerSilent : when nothing intelligible answers.
+        ProtocolUnsupported : when the device speaks another version.
+        """
+        if self._thread is not None:
+            raise DriverError(f"{self._path} has been entered already; exit first")
+        port = Port(self._path, self._baud_rate)
+        self._closing.clear()
+        self._host = NativeHost(self._deliver, self._tell)
+        self._host.link_opened(self._clock())
+        self._thread = threading.Thread(target=self._run, args=(port,), name=f"scanner {self._path}", daemon=True)
+        self._thread.start()
+        host = self._host
+        with self._changed:
+            self._changed.wait_for(
+                lambda: host.stream is not None or host.other_version is not None or self._failure is not None, _ENTER_S
+            )
+            stream, version, failure = host.stream, host.other_version, self._failure
+        if stream is not None:
+            return stream.info
+        self.exit()
+        self._failure = None
+        if failure is not None:
+            raise failure
+        if version is not None:
+            raise ProtocolUnsupported(
+                f"the scanner on {self._path} speaks version {version} of the protocol, this driver version "
+                f"{PROTOCOL_VERSION}; update the older of the two"
+            )
+        raise ScannerSilent(self._describe_silence(host.heard_bytes))
+
+    def start_pass(
+        self, line_spacing_mm: float, start_mm: float, end_mm: float, line_rate_hz: float, *, resume: bool = True
+    ) -> int:
+        """Switch the laser on and start a pass from `start_mm` to `end_mm` of the stage; return its index.
+
+        The device switches the laser off again when the pass ends. With `resume`, a pass that a dead-man or a reboot
+        interrupted goes on behind the last line that was read, as a new pass of the device: **the laser is then
+        switched on again without a further command**, even when a cable is plugged in only much later. Without it the
+        laser stays off. A pass that was stopped is never resumed.
+
+        Raises
+        ------
+        ValueError : when a value cannot be a pass.
+        ScannerRefused, ScannerTimeout, ScannerNotConnected : when the device does not do it.
+        """
+        if not (line_spacing_mm > 0 and line_rate_hz > 0):
+            raise ValueError(
+                f"line spacing and line rate must be greater than 0, not {line_spacing_mm} mm and {line_rate_hz} Hz"
+            )
+        plan = PassPlan(line_spacing_mm, start_mm, end_mm, line_rate_hz, resume)
+        with self._changed:
+            if self._host.plan is not None:
+                raise ScannerRefused(f"a pass is running on {self._path}; stop it first")
+        self.laser(True)
+        try:
+            self._command(lambda: self._host.start(plan, self._clock()))
+        except DriverError:
+            self._switch_off()
+            raise
+        return plan.index or 0
+
+    def stop_pass(self) -> None:
+        """Stop the pass and switch the laser off; returns when its last lines and `PassEnded` are in `events`.
+
+        Raises
+        ------
+        ScannerTimeout, ScannerNotConnected : when the device does not answer; its dead-man then stops it.
+        """
+        host = self._host
+        with self._changed:
+            if host.phase is not Phase.UP:
+                host.abandon(self._clock())
+        self._command(lambda: host.stop(self._clock()))
+        with self._changed:
+            self._changed.wait_for(
+                lambda: host.plan is None or host.phase is not Phase.UP or self._failure is not None, _END_S
+            )
+            if host.plan is not None:
+                host.abandon(self._clock())
+                raise ScannerTimeout(f"the scanner on {self._path} stopped, but did not report the end of its pass")
+
+    def laser(self, on: bool) -> None:
+        """Switch the laser on, and keep it on, or off, which also ends a pass.
+
+        Raises
+        ------
+        ScannerRefused, ScannerTimeout, ScannerNotConnected : when the device does not do it.
+        """
+        self._command(lambda: self._host.arm(on, self._clock()))
+
+    @property
+    def laser_on(self) -> bool | None:
+        """The device's last word on its laser; None is unknown, and to be shown as on."""
+        with self._changed:
+            return self._host.laser_on
+
+    @property
+    def is_connected(self) -> bool:
+        """True while the device answers."""
+        with self._changed:
+            return self._host.phase is Phase.UP
+
+    def events(self, timeout_s: float) -> list[Happening]:
+        """Return the lines and events since the last call, in order; waits at most `timeout_s` for the first.
+
+        Raises
+        ------
+        Exception : what has ended the reading thread, if something did.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._queue or self._failure is not None, timeout_s)
+            if self._failure is not None and not self._queue:
+                raise self._failure
+            happenings = list(self._queue)
+            self._queue.clear()
+            self._lines_waiting = 0
+        return happenings
+
+    def tally(self) -> Tally:
+        """Return the exact accounts up to now, over all boots since `enter`."""
+        with self._changed:
+            stream = self._host.stream
+            return stream.tally() if stream is not None else Tally()
+
+    def exit(self) -> None:
+        """Stop the pass, switch the laser off, close the port; never raises, and returns within about 2 s."""
+        thread = self._thread
+        if thread is None:
+            return
+        self._switch_off()
+        self._closing.set()
+        thread.join()
+        self._thread = None
+
+    def _switch_off(self) -> None:
+        """Ask for laser off and stop, wait a little; where no answer comes the dead-man does it."""
+        with self._changed:
+            host, now_s = self._host, self._clock()
+            if host.phase is not Phase.UP or self._failure is not None:
+                host.abandon(now_s)
+                return
+            stop, off = host.stop(now_s), host.arm(False, now_s)
+            self._changed.wait_for(
+                lambda: (stop.done and off.done) or host.phase is not Phase.UP or self._failure is not None, _EXIT_S
+            )
+            host.abandon(self._clock())
+
+    def _command(self, ask: Callable[[], Request]) -> None:
+        with self._changed:
+            if self._thread is None or self._host.phase is not Phase.UP:
+                raise ScannerNotConnected(f"the scanner on {self._path} is not connected; wait until it is back")
+            request = ask()
+            self._changed.wait_for(lambda: request.done or self._failure is not None)
+            if self._failure is not None:
+                raise self._failure
+        if request.ack is None:
+            raise ScannerTimeout(f"{describe_failure(request)}; check cable and power of {self._path}")
+        if not request.ok:
+            raise ScannerRefused(describe_failure(request))
+
+    def _describe_silence(self, heard_bytes: int) -> str:
+        where = f"{self._path} at {self._baud_rate} baud"
+        if heard_bytes:
+            return f"what comes from {where} is not this protocol ({heard_bytes} bytes); try the scanner's other rates"
+        return f"no scanner answers on {where}; check its power, the cable, the path and the rate"
+
+    # ---- in the thread; the functions given to the host are called with the lock held -----------------------------
+
+    def _deliver(self, profile: Profile) -> bool:
+        if self._lines_waiting >= self._queue_lines:
+            return False
+        self._queue.append(profile)
+        self._lines_waiting += 1
+        return True
+
+    def _tell(self, event: ScannerEvent) -> None:
+        if len(self._queue) - self._lines_waiting >= _MAX_EVENTS:
+            self._skipped_events += 1
+        else:
+            self._queue.append(event)
+
+    def _run(self, port: Port | None) -> None:
+        stalled_s: float | None = None
+        try:
+            while not self._closing.is_set():
+                try:
+                    if port is None:
+                        port = self._reopen()
+                        continue
+                    data = port.read(_READ_S)
+                    stalled_s = self._talk(port, data, stalled_s)
+                except PortError as error:
+                    if port is not None:
+                        port.close()
+                    port = None
+                    if not self._survives(error):
+                        return
+        except Exception as failure:  # noqa: BLE001 - the thread's loop: whoever waits must be told
+            with self._changed:
+                self._failure = failure
+                self._changed.notify_all()
+        finally:
+            if port is not None:
+                port.close()
+
+    def _talk(self, port: Port, data: bytes, stalled_s: float | None) -> float | None:
+        """Take what was read, send what is due; return since when the port has taken no bytes."""
+        with self._changed:
+            now_s = self._clock()
+            host = self._host
+            host.receive(data, now_s)
+            host.tick(now_s)
+            if host.is_silent(now_s):
+                raise PortStalled(self._path, f"the scanner on {self._path} has fallen silent; check cable and power")
+            if host.phase is Phase.OTHER_DEVICE:
+                raise PortStalled(self._path, f"another device answers on {self._path}")
+            if host.outgoing:
+                written = port.write(bytes(host.outgoing))
+                del host.outgoing[:written]
+                if written:
+                    stalled_s = None
+                elif stalled_s is None:
+                    stalled_s = now_s
+                elif now_s - stalled_s > _STALL_S:
+                    raise PortStalled(self._path, f"{self._path} takes no more bytes; check cable and power")
+            self._changed.notify_all()
+        return stalled_s
+
+    def _survives(self, error: PortError) -> bool:
+        """Tell of a lost link; True when it is worth waiting for, False when the device was never met."""
+        with self._changed:
+            met = self._host.stream is not None
+            self._host.link_lost(str(error), self._clock())
+            if not met:
+                self._failure = error
+            self._changed.notify_all()
+        return met
+
+    def _reopen(self) -> Port | None:
+        """Wait a little and try the path once."""
+        self._closing.wait(_REOPEN_S)
+        try:
+            port = Port(self._path, self._baud_rate)
+        except PortError:
+            with self._changed:
+                self._host.tick(self._clock())
+                self._changed.notify_all()
+            return None
+        with self._changed:
+            self._host.link_opened(self._clock())
+        return port

@@ -1,0 +1,301 @@
+"""Exact accounts of what was sent, stored and lost, in chunks and in lines; knows numbers only, no wire and no port.
+
+Two laws hold at any time: chunks sent = stored + lost; lines sent = whole + partial + open + lost. *Sent* is everything
+the device has numbered as far as the host can know, from the highest number or the latest totals it has read; what the
+device dropped itself is numbered too, and lost. Every loss has one reason:
+
+`device_dropped`  dropped by the device, by its own counter
+`disconnected`    in a gap during which the link was down
+`damaged`         in a gap in which damaged bytes were read
+`missing`         in a gap that nothing explains
+`late`            read, but after its line was closed
+`conflict`        read, but it contradicts its line
+`host_overflow`   read, but the host's own queue was full
+
+Counted apart, outside both laws: `duplicates` (a number read twice), `stale` (older than the account, or than the
+65,536 numbers in which a latecomer can be told from a duplicate) and `disagreements` (chunks by which the device's drop
+counter exceeds the gap it should explain).
+"""
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from drivers.protocols.unwrap import increase_u32, unwrap_u32
+
+_WINDOW = 65_536
+_MAX_GAPS = 1_024
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkTally:
+    """Chunks: `sent == stored + sum(lost.values())`."""
+
+    sent: int = 0
+    stored: int = 0
+    lost: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def balances(self) -> bool:
+        """True when nothing is unaccounted for."""
+        return self.sent == self.stored + sum(self.lost.values())
+
+
+@dataclass(frozen=True, slots=True)
+class LineTally:
+    """Lines: `sent == whole + partial + open + sum(lost.values())`; `open` is still being collected, 0 or 1."""
+
+    sent: int = 0
+    whole: int = 0
+    partial: int = 0
+    open: int = 0
+    lost: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def stored(self) -> int:
+        """Lines handed on, whole or partial."""
+        return self.whole + self.partial
+
+    @property
+    def balances(self) -> bool:
+        """True when nothing is unaccounted for."""
+        return self.sent == self.whole + self.partial + self.open + sum(self.lost.values())
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """A moment's accounts of one scanner; `a + b` joins the accounts of two boots, or of two scanners.
+
+    `damage` counts damaged pieces of the stream by reason, `bytes_skipped` their bytes.
+    """
+
+    chunks: ChunkTally = field(default_factory=ChunkTally)
+    lines: LineTally = field(default_factory=LineTally)
+    duplicates: int = 0
+    stale: int = 0
+    disagreements: int = 0
+    damage: dict[str, int] = field(default_factory=dict)
+    bytes_skipped: int = 0
+
+    def __add__(self, other: "Tally") -> "Tally":
+        a, b = self, other
+        return Tally(
+            ChunkTally(
+                a.chunks.sent + b.chunks.sent, a.chunks.stored + b.chunks.stored, _join(a.chunks.lost, b.chunks.lost)
+            ),
+            LineTally(
+                a.lines.sent + b.lines.sent,
+                a.lines.whole + b.lines.whole,
+                a.lines.partial + b.lines.partial,
+                a.lines.open + b.lines.open,
+                _join(a.lines.lost, b.lines.lost),
+            ),
+            a.duplicates + b.duplicates,
+            a.stale + b.stale,
+            a.disagreements + b.disagreements,
+            _join(a.damage, b.damage),
+            a.bytes_skipped + b.bytes_skipped,
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the accounts as plain nested dicts of integers, ready for JSON."""
+        return {
+            "chunks": {"sent": self.chunks.sent, "stored": self.chunks.stored, "lost": dict(self.chunks.lost)},
+            "lines": {
+                "sent": self.lines.sent,
+                "stored": self.lines.stored,
+                "whole": self.lines.whole,
+                "partial": self.lines.partial,
+                "open": self.lines.open,
+                "lost": dict(self.lines.lost),
+            },
+            "duplicates": self.duplicates,
+            "stale": self.stale,
+            "disagreements": self.disagreements,
+            "damage": dict(self.damage),
+            "bytes_skipped": self.bytes_skipped,
+        }
+
+
+def _join(a: dict[str, int], b: dict[str, int]) -> dict[str, int]:
+    return {reason: a.get(reason, 0) + b.get(reason, 0) for reason in sorted(a.keys() | b.keys())}
+
+
+class Kind(Enum):
+    """What an arriving chunk is to the account."""
+
+    NEW = "new"
+    DUPLICATE = "duplicate"
+    STALE = "stale"
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """An entered chunk: its line index in 64 bits, and whether it is the first of its line."""
+
+    kind: Kind
+    line: int
+    opens_line: bool
+
+
+@dataclass(slots=True)
+class _Gap:
+    """Sequences low to high - 1 that had not arrived when `high` was known; `device` of them the device dropped."""
+
+    low: int
+    high: int
+    device: int
+    cause: str
+    filled: set[int] = field(default_factory=set)
+
+
+class BootLedger:
+    """The account of one boot of one device; counters are u32 on entry and 64 bits inside.
+
+    `sequence` and `line` are the first numbers of the account, `dropped_chunks` and `dropped_lines` the device's drop
+    counters at that place.
+    """
+
+    def __init__(self, sequence: int = 0, line: int = 0, dropped_chunks: int = 0, dropped_lines: int = 0) -> None:
+        self._first_sequence = self._next_sequence = sequence
+        self._first_line = self._next_line = line
+        self._told_below = sequence  # below it a latecomer cannot be told from a duplicate
+        self._dropped_chunks = dropped_chunks
+        self._dropped_lines = dropped_lines
+        self._gaps: deque[_Gap] = deque()
+        self._cause = "missing"
+        self._stored = self._whole = self._partial = self._open = 0
+        self._lost: Counter[str] = Counter()
+        self._lost_lines: Counter[str] = Counter()
+        self._duplicates = self._stale = self._disagreements = 0
+        self._damage: Counter[str] = Counter()
+        self._bytes_skipped = 0
+
+    def chunk(self, sequence: int, line: int, dropped_chunks: int, dropped_lines: int) -> Arrival:
+        """Enter a chunk that was read, as stored; what comes of it otherwise is told by `not_kept`."""
+        number = unwrap_u32(self._next_sequence, sequence)
+        line = unwrap_u32(self._next_line, line)
+        if number < self._next_sequence:
+            kind = self._latecomer(number)
+            self._stored += kind is Kind.NEW
+            return Arrival(kind, line, False)
+        cause = self._advance(number, dropped_chunks)
+        self._next_sequence = number + 1
+        self._stored += 1
+        if line < self._next_line:
+            return Arrival(Kind.NEW, line, False)
+        self._advance_line(line, dropped_lines, cause)
+        self._next_line = line + 1
+        self._open += 1
+        return Arrival(Kind.NEW, line, True)
+
+    def totals(self, next_sequence: int, next_line: int, dropped_chunks: int, dropped_lines: int) -> None:
+        """Enter the device's word on what it has numbered so far; older word than known is passed over."""
+        number = unwrap_u32(self._next_sequence, next_sequence)
+        if number < self._next_sequence:
+            return
+        cause = self._advance(number, dropped_chunks)
+        line = unwrap_u32(self._next_line, next_line)
+        if line >= self._next_line:
+            self._advance_line(line, dropped_lines, cause)
+
+    def damage(self, reason: str, n_bytes: int) -> None:
+        """Enter a damaged piece of the stream; it explains the gap it lies in, if there is one."""
+        self._damage[reason] += 1
+        self._bytes_skipped += n_bytes
+        if self._cause == "missing":
+            self._cause = "damaged"
+
+    def link_lost(self) -> None:
+        """Enter that the link is down: the gap until the next chunk is `disconnected`."""
+        self._cause = "disconnected"
+
+    def not_kept(self, reason: str) -> None:
+        """Move a chunk entered as stored to the lost ones."""
+        self._stored -= 1
+        self._lost[reason] += 1
+
+    def line_closed(self, *, whole: bool) -> None:
+        """Enter that the open line was handed on."""
+        self._open -= 1
+        self._whole += whole
+        self._partial += not whole
+
+    def line_not_kept(self, reason: str, n_chunks: int) -> None:
+        """Enter that the open line was closed and then lost, with the `n_chunks` of it that had arrived."""
+        self._open -= 1
+        self._lost_lines[reason] += 1
+        self._stored -= n_chunks
+        self._lost[reason] += n_chunks
+
+    def count_stale(self) -> None:
+        """Enter a chunk that is none of this account's."""
+        self._stale += 1
+
+    def tally(self) -> Tally:
+        """Return the accounts as they stand."""
+        return Tally(
+            ChunkTally(self._next_sequence - self._first_sequence, self._stored, _nonzero(self._lost)),
+            LineTally(
+                self._next_line - self._first_line,
+                self._whole,
+                self._partial,
+                self._open,
+                _nonzero(self._lost_lines),
+            ),
+            self._duplicates,
+            self._stale,
+            self._disagreements,
+            _nonzero(self._damage),
+            self._bytes_skipped,
+        )
+
+    def _advance(self, number: int, dropped_chunks: int) -> str:
+        """Account for all sequences below `number`; return the cause of the gap that ends there."""
+        dropped = increase_u32(self._dropped_chunks, dropped_chunks)
+        self._dropped_chunks = dropped_chunks
+        lost = number - self._next_sequence
+        device = min(dropped, lost)
+        self._disagreements += dropped - device
+        cause, self._cause = self._cause, "missing"
+        if lost:
+            self._lost["device_dropped"] += device
+            self._lost[cause] += lost - device
+            self._gaps.append(_Gap(self._next_sequence, number, device, cause))
+            self._next_sequence = number
+            self._forget_old_gaps()
+        return cause
+
+    def _advance_line(self, line: int, dropped_lines: int, cause: str) -> None:
+        lost = line - self._next_line
+        device = min(increase_u32(self._dropped_lines, dropped_lines), lost)
+        self._dropped_lines = dropped_lines
+        self._lost_lines["device_dropped"] += device
+        self._lost_lines[cause] += lost - device
+        self._next_line = line
+
+    def _forget_old_gaps(self) -> None:
+        while self._gaps and (len(self._gaps) > _MAX_GAPS or self._gaps[0].high < self._next_sequence - _WINDOW):
+            self._told_below = self._gaps.popleft().high
+
+    def _latecomer(self, number: int) -> Kind:
+        if number < max(self._told_below, self._next_sequence - _WINDOW):
+            self._stale += 1
+            return Kind.STALE
+        gap = next((gap for gap in reversed(self._gaps) if gap.low <= number < gap.high), None)
+        if gap is None or number in gap.filled:
+            self._duplicates += 1
+            return Kind.DUPLICATE
+        if gap.high - gap.low - len(gap.filled) > gap.device:
+            self._lost[gap.cause] -= 1
+        else:  # the device sent what it had counted as dropped
+            self._lost["device_dropped"] -= 1
+            gap.device -= 1
+            self._disagreements += 1
+        gap.filled.add(number)
+        return Kind.NEW
+
+
+def _nonzero(counts: Counter[str]) -> dict[str, int]:
+    return {reason: count for reason, count in sorted(counts.items()) if count}
