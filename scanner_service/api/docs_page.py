@@ -1,0 +1,70 @@
+"""The API's own documentation: `/docs`, `/openapi.json`, and `/problems/SLUG`; everything served from here.
+
+Swagger UI is vendored unmodified (`web/vendor/swagger`), so the page works without a network, and it is the page that
+integrators know, with requests to try. It starts from a script file: no inline script, no CDN, no validator.
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from fastapi import APIRouter, Depends, FastAPI
+from starlette.exceptions import HTTPException
+from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.staticfiles import StaticFiles
+
+from scanner_service.api.problems import Problem
+from scanner_service.api.scopes import Requirement, Scoped, public
+
+SWAGGER_DIR = Path(__file__).resolve().parent.parent / "web" / "vendor" / "swagger"
+# Swagger UI sets style attributes; scripts stay limited to files of this service.
+DOCS_CSP = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+_PAGE = """<!doctype html>
+<html lang="en">
+<head><meta charset="utf-8"><title>scanner: API</title><link rel="icon" href="data:,">
+<link rel="stylesheet" href="/docs/assets/swagger-ui.css"></head>
+<body><div id="docs"><noscript>The description itself is at <a href="/openapi.json">/openapi.json</a>.</noscript></div>
+<script src="/docs/assets/swagger-ui-bundle.js"></script><script src="/docs/start.js"></script></body>
+</html>
+"""
+_START = """SwaggerUIBundle({
+  url: "/openapi.json", dom_id: "#docs", deepLinking: true, validatorUrl: null, queryConfigEnabled: false
+});
+"""
+
+
+def install_docs(app: FastAPI, problems: Iterable[Problem] = (), requirement: Requirement = public) -> None:
+    """Add the documentation to an application made with `docs_url=None, redoc_url=None, openapi_url=None`.
+
+    Parameters
+    ----------
+    problems : those that `/problems/SLUG` explains.
+    requirement : who may read the documentation; the program is open, so everyone may by default.
+    """
+    router = APIRouter(include_in_schema=False, dependencies=[Depends(requirement)])
+    by_slug = {problem.slug: problem for problem in problems}
+
+    @router.get("/docs")
+    async def docs() -> Response:
+        return HTMLResponse(_PAGE, headers={"Content-Security-Policy": DOCS_CSP})
+
+    @router.get("/docs/start.js")
+    async def start() -> Response:
+        return Response(_START, media_type="text/javascript")
+
+    @router.get("/openapi.json")
+    async def openapi() -> Response:
+        return JSONResponse(app.openapi())
+
+    @router.get("/problems/{slug}")
+    async def problem_type(slug: str) -> Response:
+        if slug not in by_slug:
+            raise HTTPException(404, "There is no problem of that name.")
+        problem = by_slug[slug]
+        return JSONResponse({"type": f"/problems/{slug}", "title": problem.title, "status": problem.status})
+
+    app.include_router(router)
+    app.mount("/docs/assets", Scoped(StaticFiles(directory=SWAGGER_DIR), requirement), name="docs-assets")
