@@ -1,4 +1,4 @@
-"""The parts that a simulated scanner can be put over, by name; knows shapes, and no optics.
+"""The parts that a simulated scanner can be put over, by name or from a file; knows no optics.
 
 Part frame: x along the laser line, y the travel, z height. The base plate's top is z = 0. Every part lies within reach
 of `optics.demo_scanner` when the sensor frame is moved along y only, so that stage position and part y are the same.
@@ -6,9 +6,12 @@ of `optics.demo_scanner` when the sensor frame is moved along y only, so that st
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from drivers.scanline import Pose
+from simulators.meshes import load_mesh
 from simulators.shapes import Cylinder, Difference, Sphere, Surface, Union, box, extruded_along_x
 
 
@@ -61,3 +64,16 @@ def sphere() -> Part:
 
 
 PARTS: dict[str, Callable[[], Part]] = {"demo": demo_part, "plate": plate, "step": step, "sphere": sphere}
+
+
+def mesh_part(path: Path, scale_to_mm: float = 1.0) -> Part:
+    """A mesh file set down with the middle of its width at x = 0, its near side at y = 0, half its height at z = 0.
+
+    Raises
+    ------
+    simulators.meshes.MeshError : when there is no mesh to be had.
+    """
+    low, high = load_mesh(path, scale_to_mm).bounds_mm
+    place = Pose(np.eye(3), -np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2]))
+    length_mm = float(high[1] - low[1])
+    return Part(load_mesh(path, scale_to_mm, place), (-1.0, length_mm + 1.0), f"the mesh {path.name}")

@@ -114,6 +114,7 @@ class PtyPort:
         self._master = self._slave = -1
         self._path: Path | None = None
         self._pending = bytearray()
+        self._is_quiet = False
         self._counts = PortCounts()
         self._requests: deque[tuple[Callable[[], None], threading.Event]] = deque()
         self._stop = threading.Event()
@@ -133,6 +134,11 @@ class PtyPort:
     def is_plugged(self) -> bool:
         """True while there is a terminal to open."""
         return self._master >= 0
+
+    @property
+    def is_quiet(self) -> bool:
+        """True once the device has said all it had to say by itself, so that a client opens on a frame's border."""
+        return self._is_quiet
 
     @property
     def has_failed(self) -> bool:
@@ -189,11 +195,22 @@ class PtyPort:
 
     def unplug(self) -> None:
         """Pull the cable: the client's terminal hangs up and the link vanishes; the device runs on unheard."""
-        self._ask(self._pull_out)
+        self.in_loop(self._pull_out)
 
     def replug(self) -> None:
         """Put the cable back: a new terminal, most likely under a new name, and the link points to it."""
-        self._ask(self._plug_in)
+        self.in_loop(self._plug_in)
+
+    def in_loop(self, action: Callable[[], None]) -> None:
+        """Have the serving thread do it: only that one may touch the device, or close what it is waiting on."""
+        if self._thread is None or not self._thread.is_alive():
+            action()
+            return
+        done = threading.Event()
+        self._requests.append((action, done))
+        while not done.wait(_LONGEST_WAIT_S):
+            if not self._thread.is_alive():
+                raise SimulatedPortError("the simulated port stopped before the cable could be moved")
 
     def __enter__(self) -> Self:
         self.start()
@@ -203,17 +220,6 @@ class PtyPort:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.stop()
-
-    def _ask(self, action: Callable[[], None]) -> None:
-        """Have the serving thread do it, since only that one may close what it is waiting on."""
-        if self._thread is None or not self._thread.is_alive():
-            action()
-            return
-        done = threading.Event()
-        self._requests.append((action, done))
-        while not done.wait(_LONGEST_WAIT_S):
-            if not self._thread.is_alive():
-                raise SimulatedPortError("the simulated port stopped before the cable could be moved")
 
     def _serve_in_thread(self) -> None:
         try:
@@ -234,17 +240,14 @@ class PtyPort:
                 self._read()
 
     def _take_from_device(self) -> None:
-        if self._pending:
-            return  # the client does not fetch: the device has to wait
         now_s = self._clock()
-        room_bytes = self._pacer.room_bytes(now_s)
-        if room_bytes <= 0:
-            return
+        # While the client does not fetch there is no room, but the device must know the time: it goes on measuring.
+        room_bytes = 0 if self._pending else self._pacer.room_bytes(now_s)
         data = self._device.transmit(now_s, room_bytes)
         if len(data) > room_bytes:
             raise ValueError(f"the device sent {len(data)} bytes where {room_bytes} were allowed")
         self._pacer.spend(len(data))
-        pieces = self._wire.carry(data) if data else self._wire.release()
+        pieces = self._wire.carry(data) if data or not room_bytes else self._wire.release()
         arrived = b"".join(pieces)
         if self._rates_differ():
             arrived = misread(arrived, self._baud_rate, self.client_baud_rate() or self._baud_rate, self._rng)
@@ -282,6 +285,7 @@ class PtyPort:
         """Until the client sends, or fetches what is pending, or the device is due; True when there is input."""
         now_s = self._clock()
         due_s = self._device.next_due_s(now_s)
+        self._is_quiet = due_s is None and not self._pending
         wait_s = _LONGEST_WAIT_S if due_s is None else min(max(due_s - now_s, 0.002), _LONGEST_WAIT_S)
         poll = select.poll()
         if self.is_plugged:

@@ -25,6 +25,7 @@ class EchoDevice:
         self.waiting = bytearray()
         self.greedy = greedy
         self.sent_bytes = 0
+        self.asked_without_room = 0
 
     def receive(self, data: bytes, now_s: float) -> None:
         if data == b"break":
@@ -35,6 +36,7 @@ class EchoDevice:
         self.waiting += data
 
     def transmit(self, now_s: float, room_bytes: int) -> bytes:
+        self.asked_without_room += room_bytes == 0
         if self.greedy:
             while len(self.waiting) < room_bytes:
                 self.waiting += EVERY_BYTE
@@ -94,6 +96,7 @@ def test_what_the_client_does_not_fetch_stays_with_the_device() -> None:
         while settled < 3 or not before:
             time.sleep(0.05)
             settled, before = (settled + 1 if device.sent_bytes == before else 0), device.sent_bytes
+        assert device.asked_without_room > 0, "it is told the time all the while, to drop what is out of date"
         fetched = host.read(before)
         assert fetched == (EVERY_BYTE * (before // 256 + 1))[:before], "held back, not lost"
 

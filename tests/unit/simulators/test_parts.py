@@ -1,11 +1,14 @@
 """Laws of the demo part: it must really cause what it was made for."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import trimesh
 
 from drivers.scanline import Pose
 from simulators.optics import Exposure, Return, demo_scanner
-from simulators.parts import PARTS
+from simulators.parts import PARTS, mesh_part
 
 LINE_SPACING_MM = 0.5
 
@@ -51,3 +54,17 @@ def test_the_demo_part_causes_shadow_steepness_thinness_and_a_hole() -> None:
     hole = (np.hypot(demo_scanner().field_of_view_mm * (np.arange(400) / 399 - 0.5) - 10.0, y - 18.0)) < 2.5
     assert (outcome[hole] == Return.NO_SURFACE).all(), "through the hole the laser meets nothing"
     assert np.nanmax(z) == pytest.approx(19.0, abs=1e-6)
+
+
+def test_a_mesh_is_set_down_within_reach_of_the_scanner(tmp_path: Path) -> None:
+    path = tmp_path / "block.stl"
+    block = trimesh.creation.box(extents=(0.02, 0.03, 0.01))
+    block.apply_translation((5.0, -7.0, 3.0))
+    block.export(path)
+    part = mesh_part(path, scale_to_mm=1000.0)
+    assert part.travel_mm == pytest.approx((-1.0, 31.0), abs=1e-2)
+    exposure = demo_scanner().trace(part.surface, Pose(np.eye(3), np.array([0.0, 15.0, 0.0])), np.random.default_rng(1))
+    seen = exposure.outcome == Return.SEEN
+    np.testing.assert_allclose(exposure.truth_mm[seen, 2], 5.0, atol=1e-2)
+    assert exposure.x_mm[seen].min() == pytest.approx(-10.0, abs=0.2)
+    assert exposure.x_mm[seen].max() == pytest.approx(10.0, abs=0.2)
