@@ -114,7 +114,9 @@ class LiveMap:
 
     # -- writing ------------------------------------------------------------------------------------------------
 
-    def add(self, line: StoredLine, radius_mm: Float64Array | None = None) -> Accepted:
+    def add(
+        self, line: StoredLine, radius_mm: Float64Array | None = None, given_by: RadiusRule = RadiusRule.FIXED
+    ) -> Accepted:
         """Take in one scanline; its answer, and that of everything it reaches, is ready at the next reading.
 
         Parameters
@@ -122,6 +124,7 @@ class LiveMap:
         line : the scanline as it is stored.
         radius_mm : (k,) radius of each point, for clouds whose radii are known beforehand; by default r_min of Eq. 6.3
             with the governing spacing, the same for the whole line.
+        given_by : the rule that `radius_mm` came from.
 
         Raises
         ------
@@ -134,9 +137,9 @@ class LiveMap:
         if radius_mm is not None:
             if radius_mm.shape != (len(line.index),) or not (np.isfinite(radius_mm) & (radius_mm > 0)).all():
                 raise ValueError("radius_mm must hold one positive finite radius a point")
-            rule = RadiusRule.FIXED
-            common = float(radius_mm.max(initial=common if len(radius_mm) == 0 else 0.0))
-        self._refuse_if_full(len(line.index))
+            rule = given_by
+            common = float(radius_mm.max(initial=0.0)) or common
+        self.can_take(line)
         of = self._passes.enter(line)
         stationary = of.slot >= 0 and of.stands_still_at(line)
         row = self._lines.append(line, of, spacing, stationary, self.origin_mm)
@@ -173,7 +176,10 @@ class LiveMap:
         for key in self._passes.open_keys():
             self.close_pass(key)
 
-    def _refuse_if_full(self, more: int) -> None:
+    def can_take(self, line: StoredLine) -> None:
+        """Return when `add` would take the line, raise MapFull or TooManyPasses as it would when not."""
+        more = len(line.index)
+        self._passes.check_room(line)
         if self._used + more > self.settings.max_points:
             raise MapFull(
                 f"the live map is configured for {self.settings.max_points} points and holds {self._used}: "
@@ -216,6 +222,10 @@ class LiveMap:
         return wanted - int(counted.sum())
 
     # -- reading ------------------------------------------------------------------------------------------------
+
+    def touch(self, rows: Int32Array) -> None:
+        """Announce rows (m,) with the next reading, although the map's own answer stands: a verdict on them changed."""
+        self._pending.append(rows)
 
     def refresh(self) -> Int32Array:
         """Evaluate whatever the lines since the last call reach; returns the rows (m,) whose answer changed, sorted."""

@@ -24,13 +24,18 @@ def pass_key(line: StoredLine) -> PassKey:
 
 @dataclass(slots=True)
 class Pass:
-    """One continuous motion: its number in the session, and what is known of its travel."""
+    """One continuous motion: its number in the session, and what is known of its travel.
+
+    `normal` is the unit normal of its laser planes, None when unknown; `direction` +1 or -1 says which way along it
+    they go, 0 before there are two different ones; `front_mm` how far along the normal the latest plane lies.
+    """
 
     number: int
     slot: int
-    heading: npt.NDArray[np.float64] | None
+    normal: npt.NDArray[np.float64] | None
     is_steady: bool = True
-    front_mm: float = -math.inf
+    direction: int = 0
+    front_mm: float = math.nan
     stations: dict[int, list[float]] = field(default_factory=dict)
 
     def stands_still_at(self, line: StoredLine) -> bool:
@@ -52,15 +57,16 @@ class Pass:
         A pass is steady while its planes stay parallel and move one way; only a steady pass settles points before
         it is closed.
         """
-        if not self.is_steady:
+        if not self.is_steady or self.normal is None:
             return False
-        parallel = self.heading is not None and float(line.plane_normal @ self.heading) > 1.0 - 1e-9
-        front = float(line.laser_mm @ self.heading) if parallel and self.heading is not None else math.nan
-        if parallel and front >= self.front_mm:
-            self.front_mm = front
-            return False
-        self.is_steady = False
-        return True
+        parallel = float(line.plane_normal @ self.normal) > 1.0 - 1e-9
+        front_mm = float(line.laser_mm @ self.normal)
+        moved = 0.0 if math.isnan(self.front_mm) else front_mm - self.front_mm
+        if self.direction == 0 and moved != 0.0:
+            self.direction = 1 if moved > 0 else -1
+        self.front_mm = front_mm
+        self.is_steady = parallel and moved * self.direction >= 0.0
+        return not self.is_steady
 
 
 class PassBook:
@@ -72,34 +78,37 @@ class PassBook:
         self.heading = np.full((MAX_OPEN_PASSES, 3), np.nan)
         self.front_q = np.full(MAX_OPEN_PASSES, -np.inf)
 
-    def enter(self, line: StoredLine) -> Pass:
-        """The pass of a line, opened if it is new.
-
-        Raises
-        ------
-        TooManyPasses : when MAX_OPEN_PASSES are open; close one first.
-        """
-        key = pass_key(line)
-        known = self._passes.get(key)
-        if known is not None:
-            return known
-        if not self._free:
+    def check_room(self, line: StoredLine) -> None:
+        """Raise TooManyPasses when the line would open a pass more than MAX_OPEN_PASSES."""
+        if pass_key(line) not in self._passes and not self._free:
             raise TooManyPasses(
                 f"{MAX_OPEN_PASSES} passes are open, so pass {line.pass_index} of {line.device_id} "
                 "cannot be told apart: close one first"
             )
-        heading = line.plane_normal.copy() if np.isfinite(line.plane_normal).all() else None
-        opened = Pass(len(self._passes), self._free.pop(), heading, is_steady=heading is not None)
+
+    def enter(self, line: StoredLine) -> Pass:
+        """The pass of a line, opened if it is new; raises TooManyPasses as `check_room` does."""
+        self.check_room(line)
+        key = pass_key(line)
+        known = self._passes.get(key)
+        if known is not None:
+            return known
+        normal = line.plane_normal.copy() if np.isfinite(line.plane_normal).all() else None
+        opened = Pass(len(self._passes), self._free.pop(), normal, is_steady=normal is not None)
         self._passes[key] = opened
-        self.publish(opened, np.zeros(3))
+        self._publish_unknown(opened.slot)
         return opened
 
     def publish(self, of: Pass, origin_mm: npt.NDArray[np.float64]) -> None:
         """Write the front of an open pass where the kernels read it."""
-        steady = of.is_steady and of.heading is not None and math.isfinite(of.front_mm)
-        self.heading[of.slot] = of.heading if steady and of.heading is not None else np.nan
-        offset = float(origin_mm @ of.heading) if of.heading is not None else 0.0
-        self.front_q[of.slot] = (of.front_mm - offset) / QUANTUM_MM if steady else -np.inf
+        if not of.is_steady or of.normal is None or of.direction == 0:
+            self._publish_unknown(of.slot)
+            return
+        self.heading[of.slot] = of.direction * of.normal
+        self.front_q[of.slot] = of.direction * (of.front_mm - float(origin_mm @ of.normal)) / QUANTUM_MM
+
+    def _publish_unknown(self, slot: int) -> None:
+        self.heading[slot], self.front_q[slot] = np.nan, -np.inf
 
     def close(self, key: PassKey) -> Pass | None:
         """Close a pass; None when it is not open."""
@@ -108,9 +117,9 @@ class PassBook:
             return None
         slot, closed.slot = closed.slot, -1
         closed.stations.clear()
-        self.heading[slot], self.front_q[slot] = np.nan, -np.inf
+        self._publish_unknown(slot)
         self._free.append(slot)
-        return Pass(closed.number, slot, closed.heading)
+        return Pass(closed.number, slot, closed.normal)
 
     def open_keys(self) -> list[PassKey]:
         """The passes that are open, in the order they were opened."""

@@ -1,10 +1,12 @@
 """The radius rules of the chapter, as pure functions of spacings and points; knows no map."""
 
+import hashlib
 import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.intake import QUANTUM_MM
@@ -66,3 +68,56 @@ def line_radius(line_spacing_mm: float, measured_mm: float, settings: RadiusSett
 def radius_squared_q(radius_mm: Float64Array) -> npt.NDArray[np.int64]:
     """floor((r / q)^2): two stored points are neighbours when their squared integer distance is at most this."""
     return np.floor((radius_mm / QUANTUM_MM) ** 2).astype(np.int64)
+
+
+FLEXIBLE_POINTS = 20
+"""A flexible scanner's radius grows until it covers this many points, the point itself counted."""
+
+GLOBAL_SHARE = 100
+"""One point in this many is in the sample for the global radius."""
+
+
+def flexible_radius_mm(
+    points_mm: Float64Array, rows: npt.NDArray[np.int64], uncertainty_mm: float, max_radius_mm: float
+) -> Float64Array:
+    """r = max(c, distance to the 20th point counting itself), capped at `max_radius_mm`; one radius a row asked for.
+
+    The chapter's rule for hand-guided scanners, made definite. `points_mm` (n, 3), `rows` (m,) of them, result (m,).
+    A capped radius covers fewer than 20 points, which the neighbourhood then says itself.
+    """
+    count = min(FLEXIBLE_POINTS, len(points_mm))
+    if not len(rows):
+        return np.zeros(0)
+    if count < FLEXIBLE_POINTS:
+        return np.full(len(rows), max_radius_mm)
+    distance = np.asarray(cKDTree(points_mm).query(points_mm[rows], k=[count])[0])
+    radius: Float64Array = np.clip(distance[:, 0], uncertainty_mm, max_radius_mm)
+    return radius
+
+
+def sample_rows(
+    device_id: str, boot_id: int, line_index: npt.NDArray[np.int64], place: npt.NDArray[np.int64]
+) -> npt.NDArray[np.int64]:
+    """Rows of the points in the repeatable 1 % sample: those whose 64-bit hash is 0 modulo GLOBAL_SHARE.
+
+    `line_index` and `place` (n,) name the points within a device's boot; nothing else enters, so a replay samples the
+    same points in any order. The mixing steps are those of splitmix64 (Steele, Lea and Flood 2014).
+    """
+    digest = hashlib.blake2b(device_id.encode(), digest_size=8).digest()
+    state = np.full(len(place), int.from_bytes(digest, "little"), dtype=np.uint64)
+    boot = np.full(len(place), boot_id, dtype=np.uint64)
+    for part in (boot, line_index.astype(np.uint64), place.astype(np.uint64)):
+        state = (state ^ part) + np.uint64(0x9E3779B97F4A7C15)
+        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        state ^= state >> np.uint64(31)
+    return np.flatnonzero(state % np.uint64(GLOBAL_SHARE) == 0)
+
+
+def global_radius_mm(
+    points_mm: Float64Array, rows: npt.NDArray[np.int64], uncertainty_mm: float, max_radius_mm: float
+) -> float:
+    """Median of the flexible radii of the sampled rows: one radius for a whole cloud. NaN when the sample is empty."""
+    if not len(rows):
+        return math.nan
+    return float(np.median(flexible_radius_mm(points_mm, rows, uncertainty_mm, max_radius_mm)))

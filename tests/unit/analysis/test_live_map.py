@@ -165,14 +165,16 @@ def test_a_version_too_old_asks_for_everything():
     assert live.changed_since(0) is None
 
 
-def test_a_steady_pass_settles_what_it_left_behind_and_closing_settles_the_rest():
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_steady_pass_settles_what_it_left_behind_and_closing_settles_the_rest(direction):
     live = new_map(max_radius_mm=1.0)
-    lines = surface_scan(SHAPES["plane"], lines=20)
+    lines = surface_scan(SHAPES["plane"], lines=20)[::direction]
     for line in lines:
         live.add(line)
     snapshot = live.snapshot()
     front_mm = lines[-1].laser_mm[1]
-    np.testing.assert_array_equal(snapshot.settled, front_mm - snapshot.points_mm[:, 1] > 1.0)
+    np.testing.assert_array_equal(snapshot.settled, direction * (front_mm - snapshot.points_mm[:, 1]) > 1.0)
+    assert 0.3 < snapshot.settled.mean() < 1.0
     live.close_pass(pass_key(lines[0]))
     assert live.snapshot().settled.all()
 

@@ -1,0 +1,68 @@
+"""The web application: routers, problems, guard and viewer put together; decides nothing itself."""
+
+from fastapi import Depends, FastAPI
+from starlette.responses import FileResponse, Response
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp
+
+from drivers.errors import DriverError, PortAbsent, PortBusy, PortNotPermitted
+from scanner_service import __version__, web
+from scanner_service.analysis.errors import MapFull
+from scanner_service.api.access import ACCESS_PROBLEMS
+from scanner_service.api.docs_page import install_docs
+from scanner_service.api.guard import Guard, GuardRules
+from scanner_service.api.login import login_router
+from scanner_service.api.origins import Allowlist
+from scanner_service.api.problems import Problem, ProblemTable, register_problems
+from scanner_service.api.routes import health, live, results, scanlines, sessions
+from scanner_service.api.scopes import Scoped, check_every_route_declares_a_scope, public
+from scanner_service.api.service import Service
+from scanner_service.sessions.errors import LineRefused, SessionBusy, SessionError, SessionNotLive, SourceUnusable
+from scanner_service.storage.errors import RecordBusy, RecordError, SessionUnknown
+from scanner_service.storage.formats.errors import FormatError
+
+SESSION_PROBLEMS: ProblemTable = {
+    SessionUnknown: Problem(404, "session-unknown", "There is no such session"),
+    SessionBusy: Problem(409, "session-busy", "The session is in another state"),
+    SessionNotLive: Problem(409, "session-not-live", "The session is not open"),
+    SessionError: Problem(409, "session-error", "The session cannot do that"),
+    SourceUnusable: Problem(422, "source-unusable", "The source cannot be read"),
+    FormatError: Problem(422, "file-unusable", "The file cannot be read"),
+    LineRefused: Problem(409, "line-refused", "The scanline was not taken"),
+    PortAbsent: Problem(404, "port-absent", "There is no such port"),
+    PortBusy: Problem(409, "port-busy", "Another program holds the port"),
+    PortNotPermitted: Problem(403, "port-not-permitted", "The port may not be opened"),
+    DriverError: Problem(502, "scanner-error", "The scanner does not do its part"),
+    MapFull: Problem(507, "map-full", "The live map is full"),
+    RecordBusy: Problem(503, "record-busy", "The record cannot take more now"),
+    RecordError: Problem(500, "record-error", "The record failed"),
+    LookupError: Problem(404, "not-found", "Not Found"),
+    ValueError: Problem(422, "invalid-value", "A value cannot be used"),
+}
+PUSH_BODY_BYTES = 16 << 20
+
+
+def make_app(service: Service, allowlist: Allowlist | None = None) -> ASGIApp:
+    """The guarded application of a service; raises ScopeUndeclared when a route does not say who may use it."""
+    app = FastAPI(title="scanner", version=__version__, docs_url=None, redoc_url=None, openapi_url=None)
+    app.state.service = service
+    app.state.access = service.access
+    problems: dict[type[Exception], Problem] = {**ACCESS_PROBLEMS, **SESSION_PROBLEMS}
+    register_problems(app, problems)
+    install_docs(app, problems.values())
+    app.include_router(login_router())
+    for module in (health, sessions, scanlines, results, live):
+        app.include_router(module.router)
+
+    @app.get("/", dependencies=[Depends(public)], include_in_schema=False)
+    async def page() -> Response:
+        return FileResponse(web.INDEX_HTML)
+
+    app.mount("/static", Scoped(StaticFiles(directory=web.STATIC_DIR), public), name="static")
+    check_every_route_declares_a_scope(app)
+    rules = GuardRules(
+        allowlist=allowlist or Allowlist(),
+        csp=web.CONTENT_SECURITY_POLICY,
+        body_limits_bytes={"/api/v1/sessions/": PUSH_BODY_BYTES},
+    )
+    return Guard(app, rules)

@@ -1,0 +1,135 @@
+"""The live stream of a session over a WebSocket: points as credit allows, status and regions as they change."""
+
+import asyncio
+import json
+from collections import deque
+
+from fastapi import APIRouter, Depends, WebSocket
+from starlette.concurrency import run_in_threadpool
+from starlette.websockets import WebSocketDisconnect
+
+from scanner_service.api.answers import plain
+from scanner_service.api.keys import Role
+from scanner_service.api.live_frames import point_messages
+from scanner_service.api.routes.sessions import status_answer
+from scanner_service.api.scopes import accepted_subprotocol, require
+from scanner_service.sessions.errors import SessionError
+from scanner_service.sessions.results import Results
+from scanner_service.sessions.session import LiveSession
+from scanner_service.storage.errors import RecordError
+
+router = APIRouter()
+UPDATE_PERIOD_S = 1 / 30
+STATUS_PERIOD_S = 0.5
+MAX_CREDIT = 64
+MAX_REQUEST_BYTES = 1024
+GOING_AWAY, POLICY, NOT_FOUND = 1001, 1008, 4404
+
+
+class _Credit:
+    """How many binary messages the client is ready to take; owned by the connection's event loop."""
+
+    def __init__(self) -> None:
+        self.left = 0
+        self.granted = asyncio.Event()
+
+    def grant(self, more: int) -> None:
+        self.left = min(MAX_CREDIT, self.left + more)
+        self.granted.set()
+
+    def spend(self) -> None:
+        self.left -= 1
+        if self.left == 0:
+            self.granted.clear()
+
+
+@router.websocket("/api/v1/sessions/{session_id}/live", dependencies=[Depends(require(Role.VIEWER))])
+async def live(websocket: WebSocket, session_id: str) -> None:
+    """Serve one client until it leaves or the session is closed."""
+    await websocket.accept(subprotocol=accepted_subprotocol(websocket))
+    try:
+        session = await run_in_threadpool(websocket.app.state.service.book.get, session_id)
+    except (RecordError, SessionError) as error:
+        await _say(websocket, {"type": "error", "detail": str(error)})
+        await websocket.close(NOT_FOUND)
+        return
+    credit = _Credit()
+    tasks = [
+        asyncio.create_task(_listen(websocket, credit)),
+        asyncio.create_task(_send_points(websocket, session, credit)),
+        asyncio.create_task(_send_status(websocket, session)),
+    ]
+    done, running = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    for task in running:
+        task.cancel()
+    await asyncio.gather(*running, return_exceptions=True)
+    for task in done:
+        await _part(websocket, task.exception())
+
+
+async def _part(websocket: WebSocket, error: BaseException | None) -> None:
+    """Say why the stream ends, when there is somebody left to be told."""
+    match error:
+        case SessionError():
+            await _say(websocket, {"type": "error", "detail": str(error)})
+            await websocket.close(GOING_AWAY)
+        case ValueError():
+            await _say(websocket, {"type": "error", "detail": str(error)})
+            await websocket.close(POLICY)
+        case None | WebSocketDisconnect() | RuntimeError():  # the client left; starlette says it in two ways
+            pass
+        case _:
+            raise error
+
+
+async def _listen(websocket: WebSocket, credit: _Credit) -> None:
+    """Take grants of credit; anything else ends the connection."""
+    while True:
+        text = await websocket.receive_text()
+        try:
+            message = json.loads(text) if len(text) <= MAX_REQUEST_BYTES else None
+        except ValueError:
+            message = None
+        more = message.get("credit") if isinstance(message, dict) else None
+        if not isinstance(more, int) or isinstance(more, bool) or more < 1:
+            raise ValueError('the only request of this stream is {"credit": n} with n of at least 1')
+        credit.grant(more)
+
+
+async def _send_points(websocket: WebSocket, session: LiveSession, credit: _Credit) -> None:
+    """Send what changed, at most 30 times a second, whenever there is credit."""
+    version = 0
+    waiting: deque[bytes] = deque()
+    has_sent = False
+    while True:
+        await credit.granted.wait()
+        if not waiting:
+            update = await asyncio.wrap_future(session.update_since(version))
+            if len(update.rows) == 0 and has_sent:
+                await asyncio.sleep(UPDATE_PERIOD_S)
+                continue
+            version = update.version
+            waiting.extend(await asyncio.to_thread(point_messages, update))
+        while waiting and credit.left:
+            credit.spend()
+            await websocket.send_bytes(waiting.popleft())
+            has_sent = True
+        await asyncio.sleep(UPDATE_PERIOD_S)
+
+
+async def _send_status(websocket: WebSocket, session: LiveSession) -> None:
+    """Send the status about twice a second, and the regions when there is a new verdict."""
+    told: Results | None = None
+    while True:
+        status = await asyncio.to_thread(status_answer, session)
+        await _say(websocket, {"type": "status", **status})
+        results = session.results()
+        if results is not None and results is not told:
+            regions = [region.to_dict() for region in results.report.regions]
+            await _say(websocket, {"type": "regions", "version": results.snapshot.version, "regions": regions})
+            told = results
+        await asyncio.sleep(STATUS_PERIOD_S)
+
+
+async def _say(websocket: WebSocket, message: dict[str, object]) -> None:
+    await websocket.send_text(json.dumps(plain(message), allow_nan=False))

@@ -1,0 +1,113 @@
+"""What a session found out: points, density map, rescan regions, summary and the files to take away."""
+
+import math
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, Query
+from starlette.responses import FileResponse, Response
+
+from scanner_service import __version__
+from scanner_service.analysis.snapshot import RadiusRule, Unreliable
+from scanner_service.api.answers import answer
+from scanner_service.api.routes.sessions import Session, viewer
+from scanner_service.rescan.judgement import Reason
+from scanner_service.sessions.outputs import OUTPUT_FILES, export_file
+from scanner_service.sessions.results import Results, summarise
+from scanner_service.sessions.session import LiveSession
+from scanner_service.storage.exports.density_png import density_png
+
+router = APIRouter(prefix="/api/v1/sessions/{session_id}", tags=["results"], dependencies=[viewer])
+MEDIA_TYPES = {".ply": "application/octet-stream", ".png": "image/png", ".json": "application/json"}
+
+
+def results_of(session: LiveSession) -> Results:
+    """The verdict on a scan that is over; on one that runs, the latest, or a first one made now."""
+    return session.results() or session.fresh_results()
+
+
+@router.get("/points")
+def list_points(
+    session: Session,
+    start: Annotated[int, Query(ge=0)] = 0,
+    limit: Annotated[int, Query(ge=1, le=10_000)] = 1000,
+) -> Response:
+    """Points from row `start` on, as arrays of equal length; what is not known is null."""
+    results = results_of(session)
+    points, verdict = results.snapshot, results.verdict
+    part = slice(start, start + limit)
+    return answer(
+        {
+            "version": points.version,
+            "total": len(points),
+            "start": start,
+            "points_mm": points.points_mm[part],
+            "scanline": points.line[part],
+            "radius_mm": points.radius_mm[part],
+            "radius_rule": [RadiusRule(rule).name.lower() for rule in points.radius_rule[part]],
+            "neighbours": points.neighbours[part],
+            "density_per_mm2": points.density_per_mm2[part],
+            "normals": points.normals[part],
+            "unreliable": [Unreliable(reason).name.lower() for reason in points.unreliable[part]],
+            "settled": points.settled[part],
+            "isolated": points.isolated[part],
+            "rescan": verdict.rescan[part],
+            "reason": [Reason(reason).label for reason in verdict.reason[part]],
+            "next": start + limit if start + limit < len(points) else None,
+        }
+    )
+
+
+@router.get("/density-map")
+def density_map(session: Session) -> Response:
+    """The cells of the density map, and the observed coverage."""
+    return answer(results_of(session).coverage.to_dict())
+
+
+@router.get("/density-map.png")
+def density_map_picture(
+    session: Session,
+    along_x: Annotated[float, Query(allow_inf_nan=False)] = 0.0,
+    along_y: Annotated[float, Query(allow_inf_nan=False)] = 0.0,
+    along_z: Annotated[float, Query(allow_inf_nan=False)] = -1.0,
+) -> Response:
+    """The density map as a picture, seen along the direction given (from above by default)."""
+    direction = np.array([along_x, along_y, along_z])
+    if not math.isclose(float(np.linalg.norm(direction)), 1.0, abs_tol=1e-3):
+        raise ValueError("along_x, along_y and along_z must be the parts of a direction of length 1")
+    results = results_of(session)
+    picture = density_png(
+        results.snapshot,
+        results.report.regions,
+        name=session.row.name,
+        coverage=results.coverage.share,
+        direction=direction,
+    )
+    return Response(picture, media_type="image/png")
+
+
+@router.get("/regions")
+def list_regions(session: Session) -> Response:
+    """The rescan regions, most urgent first."""
+    results = results_of(session)
+    return answer({"version": results.snapshot.version, **results.report.to_dict()})
+
+
+@router.get("/summary")
+def get_summary(session: Session) -> Response:
+    """What summary.json holds."""
+    return answer(summarise(results_of(session), session.losses(), session.status().points_per_s, __version__))
+
+
+@router.get("/export/{file_name}")
+def export(session: Session, file_name: str) -> Response:
+    """One of the files points.ply, density.png, regions.json, summary.json."""
+    if file_name not in OUTPUT_FILES:
+        raise LookupError(f"there is no export {file_name}; ask for one of {', '.join(OUTPUT_FILES)}")
+    made = export_file(file_name, session, results_of(session))
+    return FileResponse(
+        made.path,
+        media_type=MEDIA_TYPES[made.path.suffix],
+        filename=f"{session.row.session_id}-{file_name}",
+        background=made.forget,
+    )

@@ -1,0 +1,128 @@
+"""What requests may say, checked before anything else sees it; angles in degrees only here."""
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from drivers.scanline import Float64Array, Scanline
+from scanner_service.sessions.settings import SessionSettings
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Vector = tuple[Finite, Finite, Finite]
+MAX_PLACES = 100_000
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DeviceSourceIn(_Strict):
+    """One pass of a scanner that speaks the native protocol."""
+
+    kind: Literal["device"]
+    port: Annotated[str, Field(min_length=1, max_length=500, examples=["/dev/ttyUSB0"])]
+    baud_rate: Annotated[int, Field(gt=0, le=12_000_000)] = 3_000_000
+    line_spacing_mm: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.2
+    start_mm: Finite
+    end_mm: Finite
+    line_rate_hz: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] = 50.0
+
+
+class ReplaySourceIn(_Strict):
+    """A recorded scan that lies in the service's replay folder; `file` is its bare name."""
+
+    kind: Literal["replay"]
+    file: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00]+$", examples=["part.ply"])]
+    speed: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    units: Literal["mm", "m", "inch", "auto"] | None = None
+    line_spacing_mm: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    laser_mm: Vector | None = None
+
+
+class PushSourceIn(_Strict):
+    """Scanlines that the client pushes."""
+
+    kind: Literal["push"]
+
+
+class SettingsIn(_Strict):
+    """Radius, reliability and requirement; everything may be left out."""
+
+    uncertainty_mm: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.1
+    point_spacing_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    noise_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
+    max_normal_error_deg: Annotated[float, Field(gt=0, le=90, allow_inf_nan=False)] = 5.0
+    density_per_mm2: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    max_points: Annotated[int, Field(ge=1, le=100_000_000)] = 20_000_000
+
+    def to_settings(self) -> SessionSettings:
+        """As the session keeps it."""
+        values = self.model_dump()
+        return SessionSettings(max_normal_error_rad=math.radians(values.pop("max_normal_error_deg")), **values)
+
+
+class SessionIn(_Strict):
+    """A session to be made."""
+
+    name: Annotated[str, Field(min_length=1, max_length=200)] = "scan"
+    source: Annotated[DeviceSourceIn | ReplaySourceIn | PushSourceIn, Field(discriminator="kind")]
+    settings: SettingsIn = SettingsIn()
+    origin_mm: Vector = (0.0, 0.0, 0.0)
+
+
+class ScanlineIn(_Strict):
+    """One scanline in the part frame; a point without a return is null.
+
+    A line is known by device, boot and index: pushed again it is answered as `duplicate` and not stored twice.
+    """
+
+    device_id: Annotated[str, Field(min_length=1, max_length=200)] = "client"
+    boot_id: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    pass_index: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    line_index: Annotated[int, Field(ge=0, lt=2**63)]
+    device_time_s: Finite = 0.0
+    points_mm: Annotated[list[Vector | None], Field(max_length=MAX_PLACES)]
+    laser_mm: Vector
+    plane_normal: Vector | None = None
+    travel: Vector | None = None
+    position_mm: Finite | None = None
+    line_spacing_mm: Annotated[float, Field(gt=0, allow_inf_nan=False)]
+    step_mm: Finite | None = None
+
+    def to_scanline(self) -> Scanline:
+        """As the session takes it; raises ValueError when a direction has no length."""
+        unknown = (math.nan, math.nan, math.nan)
+        points = np.array([unknown if point is None else point for point in self.points_mm], dtype=np.float64)
+        return Scanline(
+            device_id=self.device_id,
+            boot_id=self.boot_id,
+            pass_index=self.pass_index,
+            line_index=self.line_index,
+            device_time_s=self.device_time_s,
+            points_mm=points.reshape(-1, 3),
+            missing=np.zeros(len(points), dtype=np.bool_),
+            laser_mm=np.array(self.laser_mm),
+            plane_normal=_unit("plane_normal", self.plane_normal),
+            travel=_unit("travel", self.travel),
+            position_mm=math.nan if self.position_mm is None else self.position_mm,
+            line_spacing_mm=self.line_spacing_mm,
+            step_mm=math.nan if self.step_mm is None else self.step_mm,
+        )
+
+
+class ScanlinesIn(_Strict):
+    """Scanlines, in the order in which they were taken."""
+
+    lines: Annotated[list[ScanlineIn], Field(min_length=1, max_length=256)]
+
+
+def _unit(name: str, vector: Vector | None) -> Float64Array:
+    if vector is None:
+        return np.full(3, np.nan)
+    direction = np.array(vector)
+    length = float(np.linalg.norm(direction))
+    if not length > 1e-9:
+        raise ValueError(f"{name} must have a length; leave it out when it is not known")
+    return direction / length

@@ -1,0 +1,208 @@
+"""The engine of one session: the one thread that owns its live map, taking one frozen message after another.
+
+Knows the map, the record and the ledger; knows no device, no file and no client. Whoever wants something of the map
+asks the engine, which answers between two scanlines.
+"""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import TypeVar
+
+from drivers.scanline import Float64Array, Scanline
+from scanner_service.analysis.errors import MapFull, TooManyPasses
+from scanner_service.analysis.intake import StoredLine, quantise
+from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.passes import PassKey, pass_key
+from scanner_service.sessions.errors import LineRefused, SessionNotLive
+from scanner_service.sessions.ledger import Ledger
+from scanner_service.storage.errors import RecordBusy, RecordError
+from scanner_service.storage.record import Record
+from scanner_service.storage.rows import Stored
+
+T = TypeVar("T")
+_LOG = logging.getLogger(__name__)
+INBOX_LINES = 512
+_RECORD_PATIENCE_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    line: Scanline
+    reply: "Future[Stored] | None"
+
+
+@dataclass(frozen=True, slots=True)
+class _Ask:
+    question: "Callable[[Engine], object]"
+    reply: "Future[object]"
+
+
+class Engine:
+    """Owns the live map; everything goes through `inbox`, in the order in which it was put there."""
+
+    def __init__(
+        self,
+        session_id: str,
+        record: Record,
+        settings: MapSettings,
+        origin_mm: Float64Array,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.session_id = session_id
+        self.ledger = Ledger()
+        self.live_map = LiveMap(settings, origin_mm)
+        self.failure: str | None = None
+        self._record = record
+        self._clock = clock
+        self._seen: set[tuple[str, int, int]] = set()
+        self._open: dict[str, PassKey] = {}
+        self._inbox: queue.Queue[_Line | _Ask | None] = queue.Queue(INBOX_LINES)
+        self._thread = threading.Thread(target=self._run, name=f"engine-{session_id}", daemon=True)
+        self.busy_s = 0.0
+
+    # -- for other threads --------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Begin to take messages."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Take what is in the inbox, then end; idempotent."""
+        if self._thread.is_alive():
+            self._inbox.put(None)
+            self._thread.join()
+        self._refuse_the_rest()
+
+    def put(self, line: Scanline, reply: "Future[Stored] | None" = None) -> None:
+        """Hand over a scanline; waits while the inbox is full, so that the source and not the engine holds it."""
+        if self.failure is not None or not self._thread.is_alive():
+            raise SessionNotLive(self.failure or "the session is closed and takes no scanlines")
+        self.ledger.arrived()
+        message = _Line(line, reply)
+        if not self._hand_over(message):
+            self._refuse(message, "too_late", self.failure or "the session was closed before the line's turn came")
+
+    def ask(self, question: "Callable[[Engine], T]") -> "Future[T]":
+        """Have a question answered on the engine's thread, after everything put before it."""
+        reply: Future[T] = Future()
+        if not self._hand_over(_Ask(question, reply)):  # type: ignore[arg-type]
+            reply.set_exception(SessionNotLive(self.failure or "the session is closed"))
+        return reply
+
+    def _hand_over(self, message: "_Line | _Ask") -> bool:
+        """Put a message into the inbox, waiting while it is full; False when the engine has ended."""
+        while self._thread.is_alive():
+            try:
+                self._inbox.put(message, timeout=0.5)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    # -- on the engine's thread ---------------------------------------------------------------------------------
+
+    def restore(self, line: StoredLine) -> None:
+        """Take a line that is in the record already; before `start` only."""
+        self._close_pass_before(line)
+        self._enter(line)
+        self.ledger.arrived()
+        self.ledger.decided("stored")
+
+    def close_passes(self) -> None:
+        """Close every pass: what was scanned is settled."""
+        self.live_map.close_all_passes()
+        self._open.clear()
+
+    def _run(self) -> None:
+        while True:
+            message = self._inbox.get()
+            if message is None:
+                break
+            begun = self._clock()
+            try:
+                if isinstance(message, _Line):
+                    self._take(message)
+                else:
+                    self._answer(message)
+            except Exception as error:  # noqa: BLE001 - the thread's loop: told to everybody who asks
+                _LOG.exception("the engine of session %s stopped", self.session_id)
+                self.failure = f"the session stopped by an internal fault: {error}"
+                break
+            self.busy_s += self._clock() - begun
+        self._refuse_the_rest()
+        self.live_map.close()
+
+    def _answer(self, message: _Ask) -> None:
+        if not message.reply.set_running_or_notify_cancel():
+            return
+        try:
+            message.reply.set_result(message.question(self))
+        except Exception as error:  # noqa: BLE001 - the asker gets it
+            message.reply.set_exception(error)
+
+    def _take(self, message: _Line) -> None:
+        """One scanline: quantise, record, map; the commit is not waited for."""
+        try:
+            line = quantise(message.line, self.live_map.origin_mm)
+        except ValueError as error:
+            self._refuse(message, "invalid", str(error))
+            return
+        key = (line.device_id, line.boot_id, line.line_index)
+        if key not in self._seen:
+            self._close_pass_before(line)
+            try:
+                self.live_map.can_take(line)
+            except (MapFull, TooManyPasses) as error:
+                self._refuse(message, "map_full" if isinstance(error, MapFull) else "too_many_passes", str(error))
+                return
+        try:
+            stored = self._record.append(self.session_id, line, timeout_s=_RECORD_PATIENCE_S)
+        except RecordError as error:
+            self._refuse(message, "record_busy" if isinstance(error, RecordBusy) else "record_closed", str(error))
+            return
+        stored.add_done_callback(lambda done: self._committed(done, message.reply))
+        if key not in self._seen:
+            self._enter(line)
+
+    def _close_pass_before(self, line: StoredLine) -> None:
+        """The first line of a pass ends the device's pass before it."""
+        before = self._open.get(line.device_id)
+        if before is not None and before != pass_key(line):
+            self.live_map.close_pass(before)
+        self._open[line.device_id] = pass_key(line)
+
+    def _enter(self, line: StoredLine) -> None:
+        self._seen.add((line.device_id, line.boot_id, line.line_index))
+        self.ledger.mapped(line, self.live_map.add(line))
+
+    def _refuse(self, message: _Line, reason: str, text: str) -> None:
+        self.ledger.decided(reason)
+        if message.reply is not None:
+            message.reply.set_exception(LineRefused(reason, text))
+
+    def _committed(self, done: "Future[Stored]", reply: "Future[Stored] | None") -> None:
+        """On the record's writer: the line is durable, or will never be."""
+        error = done.exception()
+        self.ledger.decided(done.result().outcome if error is None else "not_stored")
+        if reply is not None:
+            if error is None:
+                reply.set_result(done.result())
+            else:
+                reply.set_exception(error)
+
+    def _refuse_the_rest(self) -> None:
+        """What reached the inbox too late is told so."""
+        while True:
+            try:
+                message = self._inbox.get_nowait()
+            except queue.Empty:
+                return
+            if isinstance(message, _Line):
+                self._refuse(message, "too_late", self.failure or "the session was closed before the line's turn came")
+            elif isinstance(message, _Ask):
+                message.reply.set_exception(SessionNotLive(self.failure or "the session is closed"))

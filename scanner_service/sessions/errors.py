@@ -1,0 +1,32 @@
+"""What a scan session refuses, as facts.
+
+SessionError
+├── SessionNotLive      the session is in the record, but not open
+├── SessionBusy         the request does not fit the session's state
+├── SourceUnusable      what the session should read from cannot be read
+└── LineRefused         one scanline was not taken in, for the reason told
+"""
+
+
+class SessionError(Exception):
+    """Root of everything a session refuses."""
+
+
+class SessionNotLive(SessionError):
+    """The session is known, but nothing holds it open."""
+
+
+class SessionBusy(SessionError):
+    """The request does not fit the state that the session is in."""
+
+
+class SourceUnusable(SessionError):
+    """What the session should read from cannot be read."""
+
+
+class LineRefused(SessionError):
+    """One scanline was not taken in; `reason` is the name under which the ledger counts it."""
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason

@@ -1,0 +1,288 @@
+"""A live scan session: one source, one engine, one analyst, and the state that a user sees; knows no HTTP."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivers.scanline import Scanline
+from scanner_service.analysis.warm_up import warm_up
+from scanner_service.sessions.engine import Engine
+from scanner_service.sessions.errors import SessionBusy, SessionError
+from scanner_service.sessions.results import Results, judge
+from scanner_service.sessions.settings import SessionSettings
+from scanner_service.sessions.sources import PushSource, Source
+from scanner_service.sessions.updates import Update, VerdictBook, update_since
+from scanner_service.storage.errors import RecordError
+from scanner_service.storage.record import Record
+from scanner_service.storage.rows import SessionRow, Stored
+
+_LOG = logging.getLogger(__name__)
+ANALYSIS_PERIOD_S = 1.0
+"""Regions are looked for about this often during a scan, and less often when one search takes long."""
+
+STATES = ("created", "scanning", "paused", "interrupted", "stopped", "failed")
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What a session is doing, for people: counts, rates, losses and, when something is amiss, one sentence."""
+
+    session_id: str
+    name: str
+    state: str
+    created_utc: str
+    lines: int
+    points: int
+    points_per_s: float
+    coverage: float
+    progress: float | None
+    losses: dict[str, Any]
+    durable: dict[str, dict[str, int]]
+    message: str | None
+
+
+class LiveSession:
+    """One session held open. Its methods may be called from any thread."""
+
+    def __init__(
+        self,
+        row: SessionRow,
+        record: Record,
+        source: Source,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.row = row
+        self.settings = SessionSettings.from_dict(row.settings)
+        self.source = source
+        self.engine = Engine(row.session_id, record, self.settings.map_settings(), np.array(row.origin_mm), clock)
+        self.verdicts = VerdictBook()
+        self._record = record
+        self._clock = clock
+        self._state = row.state
+        self._message: str | None = None
+        self._results: Results | None = None
+        self._results_changed = threading.Condition()
+        self._lock = threading.RLock()
+        self._begun_s: float | None = None
+        self._ended_s: float | None = None
+        self._closing = threading.Event()
+        self._analyst = threading.Thread(target=self._analyse, name=f"analyst-{row.session_id}", daemon=True)
+
+    @property
+    def state(self) -> str:
+        """One of STATES."""
+        return self._state
+
+    def open(self, on_progress: Callable[[int], None] = lambda lines: None) -> None:
+        """Take what the record already holds of the session into the map, then be ready.
+
+        Raises RecordError when the record cannot be read; a damaged line is told in the status and left out.
+        """
+        warm_up()
+        damaged: list[str] = []
+        for number, line in self._record.lines(
+            self.row.session_id, on_damage=lambda found: damaged.append(found.reason)
+        ):
+            self.engine.restore(line)
+            on_progress(number)
+        if damaged:
+            self._message = f"{len(damaged)} stored lines are damaged and left out; the first: {damaged[0]}"
+        if self._state in ("stopped", "failed", "interrupted"):
+            self.engine.close_passes()
+        self.engine.start()
+        self._analyst.start()
+
+    # -- what a user does ---------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Begin, or go on, to scan.
+
+        Raises
+        ------
+        SessionBusy : the session is scanning, or its source was used up.
+        SourceUnusable, DriverError : the source cannot start; the state is unchanged.
+        """
+        with self._lock:
+            if self._state == "scanning":
+                raise SessionBusy("the session is scanning already")
+            if self._state != "created" and not isinstance(self.source, PushSource):
+                raise SessionBusy(f"the session is {self._state}; create another one to scan again")
+            self.source.start(self)
+            self._begun_s = self._clock()
+            self._ended_s = None
+            self._set_state("scanning")
+
+    def push(self, line: Scanline) -> "Future[Stored]":
+        """Hand over a scanline of a client; the future has the record's answer once the line is durable.
+
+        Raises
+        ------
+        SessionBusy : the session does not take pushed lines, or is not started.
+        """
+        if not isinstance(self.source, PushSource):
+            raise SessionBusy("this session reads from a source of its own and takes no pushed scanlines")
+        if self._state != "scanning":
+            raise SessionBusy(f"the session is {self._state}: start it before pushing scanlines")
+        reply: Future[Stored] = Future()
+        self.engine.put(line, reply)
+        return reply
+
+    def stop(self) -> None:
+        """End the scan: close the source and the passes, judge what there is; idempotent."""
+        if self._state in ("scanning", "paused", "created"):
+            self.source.stop()
+            self._finish(None)
+
+    def close(self) -> None:
+        """Let go of everything; a session that is scanning is stopped first."""
+        self.stop()
+        self._closing.set()
+        if self._analyst.is_alive():
+            self._analyst.join()
+        self.engine.close()
+
+    # -- what a source says (Sink) ------------------------------------------------------------------------------
+
+    def line(self, line: Scanline) -> None:
+        """A scanline from the source; lines that come when the engine is gone are counted by it."""
+        try:
+            self.engine.put(line)
+        except SessionError as error:
+            _LOG.warning("a scanline of session %s was not taken: %s", self.row.session_id, error)
+
+    def note(self, kind: str, details: dict[str, Any]) -> None:
+        """An event from the source: goes into the record, and may pause or resume the session."""
+        self._event(kind, details)
+        if kind == "interrupted":
+            self._message = f"the scanner is gone ({details.get('reason')}); waiting for it to return"
+            self._set_state("paused")
+        elif kind == "resumed":
+            self._message = None
+            self._set_state("scanning")
+
+    def ended(self, failure: str | None) -> None:
+        """The source is used up."""
+        if self._state in ("scanning", "paused"):
+            self._finish(failure)
+
+    # -- what a reader asks -------------------------------------------------------------------------------------
+
+    def update_since(self, version: int) -> "Future[Update]":
+        """Everything that changed after `version` of the map; 0 asks for all."""
+        return self.engine.ask(lambda engine: update_since(engine.live_map, self.verdicts, version))
+
+    def results(self) -> Results | None:
+        """The latest verdict; None before the first."""
+        return self._results
+
+    def fresh_results(self, timeout_s: float = 120.0) -> Results:
+        """A verdict on everything that was put in before this call."""
+        results = self._judge()
+        if results is None:
+            raise SessionError(self.engine.failure or "the session is closed")
+        return results
+
+    def wait_until_over(self, timeout_s: float | None = None) -> bool:
+        """Wait until the session is stopped or failed and judged; False when it is not after `timeout_s`."""
+        with self._results_changed:
+            return self._results_changed.wait_for(
+                lambda: self._state in ("stopped", "failed") and self._results is not None, timeout_s
+            )
+
+    def elapsed_s(self) -> float:
+        """Seconds from the start of the scan to its end, or to now."""
+        if self._begun_s is None:
+            return 0.0
+        return (self._ended_s if self._ended_s is not None else self._clock()) - self._begun_s
+
+    def losses(self) -> dict[str, Any]:
+        """The whole ledger: lines, points, and what the driver counted on the wire."""
+        return self.engine.ledger.to_dict(self.source.tally())
+
+    def status(self) -> Status:
+        """What the session is doing now."""
+        ledger = self.engine.ledger
+        elapsed = self.elapsed_s()
+        results = self._results
+        durable = {
+            device: {"boot_id": mark.boot_id, "line_index": mark.line_index, "lines": mark.line_count}
+            for device, mark in self._record.watermark(self.row.session_id).items()
+        }
+        return Status(
+            session_id=self.row.session_id,
+            name=self.row.name,
+            state=self._state,
+            created_utc=self.row.created_utc,
+            lines=ledger.received,
+            points=ledger.counted,
+            points_per_s=ledger.counted / elapsed if elapsed > 0 else 0.0,
+            coverage=results.coverage.share if results is not None else float("nan"),
+            progress=self.source.progress(),
+            losses=self.losses(),
+            durable=durable,
+            message=self.engine.failure or self._message,
+        )
+
+    # -- inside -------------------------------------------------------------------------------------------------
+
+    def _finish(self, failure: str | None) -> None:
+        """Close the passes and judge for the last time; the state changes when the verdict is there."""
+        with self._lock:
+            if self._state in ("stopped", "failed"):
+                return
+            self.engine.ask(lambda engine: engine.close_passes()).result()
+            self._ended_s = self._clock()
+            self._judge()
+            self._event("losses", self.losses())
+            if failure is not None:
+                self._message = failure
+            self._set_state("failed" if failure is not None else "stopped")
+        with self._results_changed:
+            self._results_changed.notify_all()
+
+    def _analyse(self) -> None:
+        """The analyst's thread: a verdict about every second while the map changes."""
+        period_s = ANALYSIS_PERIOD_S
+        seen = -1
+        while not self._closing.wait(period_s):
+            begun_s = self._clock()
+            if self._state in ("scanning", "paused") or self._results is None:
+                before = seen
+                results = self._judge(unless=before)
+                seen = results.snapshot.version if results is not None else seen
+            period_s = max(ANALYSIS_PERIOD_S, 4.0 * (self._clock() - begun_s))
+
+    def _judge(self, unless: int | None = None) -> Results | None:
+        """Take a snapshot, judge it, and put the verdict in force; None when the engine is gone."""
+        try:
+            snapshot = self.engine.ask(lambda engine: engine.live_map.snapshot()).result()
+            if unless is not None and snapshot.version == unless:
+                return self._results
+            results = judge(snapshot, self.settings.requirement(), self.source.geometry)
+            self.engine.ask(lambda engine: self.verdicts.replace(results.verdict, engine.live_map)).result()
+        except SessionError:
+            return None
+        with self._results_changed:
+            if self._results is None or results.snapshot.version >= self._results.snapshot.version:
+                self._results = results
+            self._results_changed.notify_all()
+        return results
+
+    def _event(self, kind: str, details: dict[str, Any]) -> None:
+        try:
+            self._record.append_event(self.row.session_id, kind, details, timeout_s=1.0)
+        except RecordError:
+            _LOG.warning("the event %s of session %s could not be recorded", kind, self.row.session_id)
+
+    def _set_state(self, state: str) -> None:
+        self._state = state
+        try:
+            self._record.set_state(self.row.session_id, state)
+        except (RecordError, TimeoutError) as error:
+            _LOG.warning("the state of session %s could not be recorded: %s", self.row.session_id, error)

@@ -1,0 +1,243 @@
+"""Where a session's scanlines come from: a device on a port, a recorded file, or lines pushed by a client.
+
+A source runs its own thread and hands frozen scanlines to a `Sink`; it knows no map, no record and no client.
+"""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from drivers.errors import DriverError
+from drivers.protocols.scanner_events import (
+    Disconnected,
+    OtherDevice,
+    PassEnded,
+    PassNotResumed,
+    PassResumed,
+    Rebooted,
+    Reconnected,
+)
+from drivers.rig import Rig
+from drivers.scanline import DeviceInfo, Profile, Scanline, SensorGeometry
+from drivers.scanners.native import Happening, NativeScanner
+from scanner_service.sessions.errors import SourceUnusable
+from scanner_service.storage.formats.recording import Recording
+
+
+class Sink(Protocol):
+    """What a source may tell its session."""
+
+    def line(self, line: Scanline) -> None:
+        """A scanline; waits while the session is busy."""
+
+    def note(self, kind: str, details: dict[str, Any]) -> None:
+        """Something happened: `interrupted`, `reconnected`, `resumed`, `not_resumed`, `rebooted`, `pass_ended`."""
+
+    def ended(self, failure: str | None) -> None:
+        """Nothing more will come; `failure` says why when that was not planned."""
+
+
+class Source(Protocol):
+    """A place where scanlines come from."""
+
+    geometry: SensorGeometry | None
+
+    def start(self, sink: Sink) -> None:
+        """Begin to deliver; raises SourceUnusable or a DriverError when that cannot be done."""
+
+    def stop(self) -> None:
+        """Stop delivering and let go of everything; idempotent."""
+
+    def tally(self) -> dict[str, Any] | None:
+        """What the driver counted, None for a source without a wire."""
+
+    def progress(self) -> float | None:
+        """Share of the work that is done, None when the end is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class PassRequest:
+    """One pass of the stage, from `start_mm` to `end_mm`, lines `line_spacing_mm` apart."""
+
+    line_spacing_mm: float
+    start_mm: float
+    end_mm: float
+    line_rate_hz: float
+
+
+class DeviceSource:
+    """One pass of a scanner on a serial port, placed on the part by a rig."""
+
+    def __init__(self, scanner: NativeScanner, rig: Rig, request: PassRequest, info: DeviceInfo) -> None:
+        self.geometry: SensorGeometry | None = info.geometry
+        self.info = info
+        self._scanner = scanner
+        self._rig = rig
+        self._request = request
+        self._position_mm = request.start_mm
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self, sink: Sink) -> None:
+        """Start the pass on the device and pump its events to the sink."""
+        request = self._request
+        self._scanner.start_pass(
+            request.line_spacing_mm, request.start_mm, request.end_mm, request.line_rate_hz, resume=True
+        )
+        self._thread = threading.Thread(target=self._pump, args=(sink,), name="device-source", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the pass, switch the laser off and close the port."""
+        self._stopping.set()
+        with contextlib.suppress(DriverError):  # the device may be gone: then there is nothing left to stop
+            self._scanner.stop_pass()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def tally(self) -> dict[str, Any] | None:
+        """Chunks and lines: sent, stored, lost by reason."""
+        return self._scanner.tally().to_dict()
+
+    def progress(self) -> float | None:
+        """Share of the travel that the stage has covered."""
+        span = self._request.end_mm - self._request.start_mm
+        return min(1.0, max(0.0, (self._position_mm - self._request.start_mm) / span)) if span else None
+
+    def _pump(self, sink: Sink) -> None:
+        failure: str | None = None
+        is_over = False
+        try:
+            while not is_over:
+                events = self._scanner.events(0.1)
+                if not events and self._stopping.is_set():
+                    break
+                for event in events:
+                    if isinstance(event, PassNotResumed):
+                        failure, is_over = event.reason, True
+                    is_over = self._pass_on(event, sink) or is_over
+        except DriverError as error:
+            failure = str(error)
+        self._scanner.exit()
+        sink.ended(failure)
+
+    def _pass_on(self, event: Happening, sink: Sink) -> bool:
+        """Tell the sink of one event; True when the pass is over."""
+        match event:
+            case Profile():
+                self._position_mm = event.position_mm
+                sink.line(self._rig.place(event))
+            case Disconnected(reason=reason):
+                sink.note("interrupted", {"reason": reason})
+            case OtherDevice(expected_id=expected, found_id=found):
+                sink.note("interrupted", {"reason": f"on its port scanner {found} answers instead of {expected}"})
+            case Reconnected(gap_s=gap_s, streaming=streaming):
+                sink.note("reconnected", {"gap_s": gap_s, "streaming": streaming})
+                if streaming:
+                    sink.note("resumed", {})
+            case PassResumed(pass_index=pass_index, from_mm=from_mm):
+                sink.note("resumed", {"pass_index": pass_index, "from_mm": from_mm})
+            case PassNotResumed(reason=reason):
+                sink.note("not_resumed", {"reason": reason})
+            case Rebooted(old_boot_id=old, new_boot_id=new):
+                sink.note("rebooted", {"old_boot_id": old, "new_boot_id": new})
+            case PassEnded(pass_index=pass_index, reason=reason):
+                sink.note("pass_ended", {"pass_index": pass_index, "reason": reason})
+                return reason in ("reached_end", "stopped")
+        return False
+
+
+class ReplaySource:
+    """A recorded scan, played as fast as it is taken or at `speed` times the pace of its device times."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        speed: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        geometry: SensorGeometry | None = None,
+    ) -> None:
+        self.geometry = geometry
+        self._recording = recording
+        self._speed = speed
+        self._clock = clock
+        self._played = 0
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self, sink: Sink) -> None:
+        """Begin to play."""
+        self._thread = threading.Thread(target=self._play, args=(sink,), name="replay-source", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop playing."""
+        self._stopping.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def tally(self) -> dict[str, Any] | None:
+        """What the file held, and what of it could not be used."""
+        recording = self._recording
+        return {"points_declared": recording.points_declared, "dropped": dict(recording.dropped)}
+
+    def progress(self) -> float | None:
+        """Share of the lines that were played."""
+        return self._played / len(self._recording.lines) if self._recording.lines else 1.0
+
+    def _play(self, sink: Sink) -> None:
+        begun_s = self._clock()
+        first_s = self._recording.lines[0].device_time_s if self._recording.lines else 0.0
+        for line in self._recording.lines:
+            if self._speed is not None:
+                due_s = (line.device_time_s - first_s) / self._speed
+                self._stopping.wait(max(0.0, due_s - (self._clock() - begun_s)))
+            if self._stopping.is_set():
+                break
+            sink.line(line)
+            self._played += 1
+        sink.ended(None)
+
+
+class SpentSource:
+    """The source of a session that was reopened from the record: what it had is stored, nothing more comes."""
+
+    geometry: SensorGeometry | None = None
+
+    def start(self, sink: Sink) -> None:
+        """Cannot be started again."""
+        raise SourceUnusable("this session was reopened from the record; create another one to scan again")
+
+    def stop(self) -> None:
+        """Nothing to let go of."""
+
+    def tally(self) -> dict[str, Any] | None:
+        """What the driver counted is in the record's events."""
+        return None
+
+    def progress(self) -> float | None:
+        """Everything that was stored is there."""
+        return 1.0
+
+
+class PushSource:
+    """Lines that a client pushes through the session itself: nothing to run, nothing that ends by itself."""
+
+    geometry: SensorGeometry | None = None
+
+    def start(self, sink: Sink) -> None:
+        """Nothing to begin."""
+
+    def stop(self) -> None:
+        """Nothing to let go of."""
+
+    def tally(self) -> dict[str, Any] | None:
+        """There is no wire."""
+        return None
+
+    def progress(self) -> float | None:
+        """The end is not known."""
+        return None
