@@ -1,0 +1,319 @@
+// Puts the page together: which part is told what, and when; every rule lives in the part that it calls.
+
+import { SCALES } from "./colours.js";
+import { byId, element } from "./element.js";
+import { drawRuler, drawTriad } from "./gauges.js";
+import { listenToKeys } from "./keyboard.js";
+import { drawLegend } from "./legend.js";
+import { words } from "./numbers.js";
+import { drawFigures, drawInspector, drawLosses, drawRegions } from "./panels.js";
+import { pickPoint } from "./picking.js";
+import { PointCloud } from "./point_cloud.js";
+import { RegionOverlay } from "./region_overlay.js";
+import { SceneView } from "./scene_view.js";
+import { exportAddress, listSessions, startSession, stopSession } from "./service.js";
+import { SessionPicker } from "./session_picker.js";
+import { OVER, SCANNING, SessionView } from "./session_view.js";
+
+const SURVEY_MS = 1000;
+const CLICK_SLACK_PX = 4;
+const EXPORTS = { "points.ply": "points with normals, density and flags", "density.png": "density map as a picture", "regions.json": "rescan regions", "summary.json": "summary of the session" };
+
+const look = { rule: "density", scale: "viridis", range: [0, 1], autoRange: true, pointScale: 1 };
+let chosenRegion = null;
+let inspectedRow = -1;
+let connectionState = "none";
+let frames = 0;
+
+const session = new SessionView({ points, status, regions, connection, trouble });
+const view = openView();
+const cloud = new PointCloud(session.store);
+const overlay = new RegionOverlay(byId("labels"), chooseRegion);
+const marker = element("div.marker", { hidden: true, "aria-hidden": "true" });
+byId("view").append(marker);
+view.scene.add(cloud.object, overlay.group);
+
+const picker = new SessionPicker({ onChoose: openSession, onMissing: (text) => notice(text), current: () => session.id });
+
+function openView() {
+  try {
+    return new SceneView(byId("canvas"), { beforeDraw, afterDraw });
+  } catch (error) {
+    notice("This browser shows no WebGL 2, which the point cloud needs. Figures, regions and exports still work elsewhere.");
+    throw error;
+  }
+}
+
+// --- what arrives ---------------------------------------------------------------------------------------------------
+
+function points() {
+  notice("");
+  view.invalidate();
+}
+
+function status() {
+  const { status: told } = session;
+  const state = byId("session-state");
+  state.hidden = false;
+  state.textContent = words(told.state);
+  state.dataset.state = told.state;
+  byId("stop").hidden = OVER.has(told.state) || told.state === "created";
+  byId("start").hidden = OVER.has(told.state) || SCANNING.has(told.state);
+  byId("stop-note").hidden = byId("stop").hidden;
+  const progress = byId("progress");
+  progress.hidden = told.progress === null || told.progress === undefined;
+  if (!progress.hidden) progress.value = told.progress;
+  say(told.message ?? "");
+  drawFigures(byId("figures"), told, session.store, session.box);
+  drawLosses(byId("losses"), byId("losses-count"), told.losses);
+}
+
+function regions() {
+  const list = session.regions ?? [];
+  overlay.show(list, session.origin, view.radius);
+  overlay.choose(chosenRegion);
+  drawRegions(byId("regions"), byId("regions-count"), session.regions, chosenRegion, chooseRegion);
+  legend();
+  view.invalidate();
+}
+
+function connection({ state, seconds, attempt, reason }) {
+  connectionState = state;
+  const texts = {
+    connecting: attempt ? "Connecting again…" : "Connecting…",
+    open: "Live",
+    quiet: `No word from the service for ${seconds} s`,
+    waiting: `Connection lost. Trying again in ${Math.max(1, Math.round(seconds))} s`,
+    finished: "Finished",
+    "signed-out": "Not signed in",
+    absent: "No such session",
+    closed: "Closed",
+  };
+  byId("connection").dataset.state = state;
+  byId("connection-text").textContent = texts[state] ?? state;
+  byId("connection").title = reason || "";
+  byId("retry").hidden = state !== "waiting";
+  byId("view").classList.toggle("stale", state === "waiting" || state === "connecting" || state === "quiet");
+  if (state === "open") say(session.status?.message ?? "");
+  if (state === "absent") notice(reason || "There is no such session.");
+  if (state === "signed-out") say("Not signed in. Open the one-time address that the service printed when it started.");
+  if (state === "waiting") listSessions().catch((refusal) => say(refusal.message)); // it may say why
+}
+
+function trouble(text) {
+  say(text);
+}
+
+// --- the picture ----------------------------------------------------------------------------------------------------
+
+function beforeDraw() {
+  cloud.upload();
+  cloud.pointPx = Math.min(9, Math.max(1.6, 1.5 * session.spacingMm * view.pixelsPerMm)) * look.pointScale * view.renderer.getPixelRatio();
+  overlay.follow(view);
+}
+
+function afterDraw() {
+  frames += 1;
+  session.drawn();
+  drawTriad(byId("triad"), view.camera);
+  drawRuler(byId("ruler-text"), byId("ruler-bar"), view.pixelsPerMm);
+  marker.hidden = inspectedRow < 0;
+  if (inspectedRow < 0) return;
+  const at = view.project(session.store.xyz.subarray(3 * inspectedRow, 3 * inspectedRow + 3));
+  marker.style.transform = `translate(${at.x.toFixed(1)}px, ${at.y.toFixed(1)}px)`;
+}
+
+function survey() {
+  if (!session.survey()) return;
+  if (session.box) view.setBox(session.box);
+  if (look.autoRange) look.range = session.densityRange(look.range);
+  applyLook();
+  drawFigures(byId("figures"), session.status, session.store, session.box);
+  inspect(inspectedRow);
+}
+
+function applyLook() {
+  cloud.rule = look.rule;
+  cloud.range = look.range;
+  if (session.box) cloud.heightRange = [session.box.low[2], session.box.high[2]];
+  byId("scale-label").hidden = look.rule === "normals" || look.rule === "rescan";
+  if (look.autoRange) [byId("range-low").value, byId("range-high").value] = look.range;
+  legend();
+  view.invalidate();
+}
+
+function legend() {
+  if (!session.box) return;
+  const height = look.rule === "height";
+  const range = height ? [session.box.low[2] + session.origin[2], session.box.high[2] + session.origin[2]] : look.range;
+  drawLegend(byId("legend"), { rule: look.rule, scale: look.scale, range, sample: height ? [] : session.sample, required: session.requiredPerMm2 });
+}
+
+// --- what the user does ---------------------------------------------------------------------------------------------
+
+function openSession(chosen) {
+  byId("session-name").textContent = chosen.name || chosen.id;
+  document.title = `${chosen.name || chosen.id} – scan viewer`;
+  byId("session-state").hidden = true;
+  byId("start").hidden = byId("stop").hidden = true;
+  history.replaceState(null, "", `?session=${encodeURIComponent(chosen.id)}`);
+  chosenRegion = null;
+  inspect(-1);
+  say("");
+  view.touched = false;
+  look.range = look.autoRange ? [0, 1] : look.range;
+  notice("Waiting for the first points…");
+  session.open(chosen.id);
+  overlay.show([], session.origin, view.radius);
+  drawFigures(byId("figures"), null, session.store, null);
+  drawLosses(byId("losses"), byId("losses-count"), null);
+  drawRegions(byId("regions"), byId("regions-count"), null, null, chooseRegion);
+  byId("legend").hidden = true;
+  byId("exports").hidden = false;
+  byId("export-links").replaceChildren(...Object.entries(EXPORTS).map(([file, text]) => element("li", {}, element("a", { href: exportAddress(chosen.id, file), download: file }, file, element("span", {}, text)))));
+  view.invalidate();
+}
+
+function chooseRegion(number) {
+  const region = session.regions?.find((candidate) => candidate.number === number);
+  if (!region) return;
+  chosenRegion = number;
+  overlay.choose(number);
+  drawRegions(byId("regions"), byId("regions-count"), session.regions, chosenRegion, chooseRegion);
+  byId("regions").querySelector("[aria-pressed=true]")?.scrollIntoView({ block: "nearest" });
+  view.focus(region.centroid_mm.map((value, axis) => value - session.origin[axis]), { sizeMm: extentMm(region), normal: region.normal });
+}
+
+function extentMm(region) {
+  const corners = (region.outline_mm ?? []).flat();
+  const reach = corners.map((corner) => Math.hypot(...corner.map((value, axis) => value - region.centroid_mm[axis])));
+  return reach.length ? 2 * Math.max(...reach) : 2 * Math.sqrt(region.area_mm2);
+}
+
+function inspect(row) {
+  inspectedRow = row < session.store.end ? row : -1;
+  drawInspector(byId("inspector"), session.store, inspectedRow, session.origin, () => inspect(-1));
+  view.invalidate();
+}
+
+function clear() {
+  inspect(-1);
+  chosenRegion = null;
+  overlay.choose(null);
+  drawRegions(byId("regions"), byId("regions-count"), session.regions, null, chooseRegion);
+}
+
+function rowUnder(event) {
+  const frame = view.canvas.getBoundingClientRect();
+  return pickPoint(session.store, view.clipFromPart(), view.width, view.height, event.clientX - frame.left, event.clientY - frame.top);
+}
+
+function say(text) {
+  byId("message").hidden = !text;
+  if (byId("message").textContent !== text) byId("message").textContent = text;
+}
+
+function notice(text) {
+  if (byId("notice").textContent !== text) byId("notice").textContent = text;
+}
+
+async function command(button, act) {
+  button.disabled = true;
+  try {
+    await act(session.id);
+  } catch (refusal) {
+    say(refusal.message);
+  }
+  button.disabled = false;
+}
+
+function listen() {
+  let down = null;
+  view.canvas.addEventListener("pointerdown", (event) => {
+    down = event.button === 0 ? event : null;
+  });
+  view.canvas.addEventListener("pointerup", (event) => {
+    if (down && Math.hypot(event.clientX - down.clientX, event.clientY - down.clientY) < CLICK_SLACK_PX) inspect(rowUnder(event));
+    down = null;
+  });
+  view.canvas.addEventListener("dblclick", (event) => {
+    const row = rowUnder(event);
+    if (row >= 0) view.focus(session.store.xyz.slice(3 * row, 3 * row + 3));
+  });
+  for (const [name, { text }] of Object.entries(SCALES)) byId("scale").append(element("option", { value: name }, text));
+  byId("rule").addEventListener("change", (event) => {
+    look.rule = event.target.value;
+    applyLook();
+  });
+  byId("scale").addEventListener("change", (event) => {
+    look.scale = cloud.scale = event.target.value;
+    applyLook();
+  });
+  for (const button of document.querySelectorAll("[data-view]")) {
+    button.addEventListener("click", () => (button.dataset.view === "fit" ? view.fit() : view.look(button.dataset.view)));
+  }
+  byId("show-regions").addEventListener("change", (event) => {
+    overlay.visible = event.target.checked;
+    view.invalidate();
+  });
+  byId("shaded").addEventListener("change", (event) => {
+    cloud.shaded = event.target.checked;
+    view.invalidate();
+  });
+  byId("point-size").addEventListener("input", (event) => {
+    look.pointScale = Number(event.target.value);
+    view.invalidate();
+  });
+  byId("range-auto").addEventListener("change", (event) => {
+    look.autoRange = event.target.checked;
+    byId("range-low").disabled = byId("range-high").disabled = look.autoRange;
+    if (look.autoRange) look.range = session.densityRange([-1, 0]);
+    applyLook();
+  });
+  for (const id of ["range-low", "range-high"]) {
+    byId(id).addEventListener("change", () => {
+      const [low, high] = [byId("range-low").valueAsNumber, byId("range-high").valueAsNumber];
+      const sound = low < high;
+      byId("range-high").setCustomValidity(sound ? "" : "must be larger than the lower end");
+      if (sound) {
+        look.range = [low, high];
+        applyLook();
+      } else {
+        byId("range-high").reportValidity();
+      }
+    });
+  }
+  byId("start").addEventListener("click", (event) => command(event.currentTarget, startSession));
+  byId("stop").addEventListener("click", (event) => command(event.currentTarget, stopSession));
+  byId("retry").addEventListener("click", () => session.retryNow());
+  addEventListener("online", () => session.retryNow());
+  document.addEventListener("pointerdown", (event) => {
+    for (const menu of document.querySelectorAll("details[open]")) if (!menu.contains(event.target)) menu.open = false;
+  });
+  listenToKeys(view, { openSessions: () => picker.show(), clear });
+  setInterval(survey, SURVEY_MS);
+}
+
+// Numbers for tests and the curious; nothing can be changed through it.
+globalThis.viewer = Object.freeze({
+  get session() { return session.id ?? null; },
+  get points() { return session.store.received; },
+  get total() { return session.store.total; },
+  get version() { return session.store.version; },
+  get skipped() { return session.store.skipped; },
+  get capacity() { return session.store.capacity; },
+  get uploadedRows() { return cloud.uploadedRows; },
+  get regions() { return session.regions?.length ?? 0; },
+  get connection() { return connectionState; },
+  get flying() { return view.flight !== null; },
+  get frames() { return frames; },
+  get inspected() { return inspectedRow; },
+  get densityRange() { return [...look.range]; },
+  get target() { return view.controls.target.toArray(); },
+  get eye() { return view.camera.position.toArray(); },
+});
+
+listen();
+drawFigures(byId("figures"), null, session.store, null);
+applyLook();
+picker.begin(new URLSearchParams(location.search).get("session"));

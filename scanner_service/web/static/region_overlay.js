@@ -1,0 +1,101 @@
+// Rescan regions in the view: outlines on the surface, each reason its own dash, and numbered labels; chooses nothing.
+
+import { Color, GreaterDepth, Group, Vector2, Vector3 } from "three";
+import { LineMaterial } from "./vendor/three/examples/jsm/lines/LineMaterial.js";
+import { LineSegments2 } from "./vendor/three/examples/jsm/lines/LineSegments2.js";
+import { LineSegmentsGeometry } from "./vendor/three/examples/jsm/lines/LineSegmentsGeometry.js";
+import { reasonByKey } from "./stream_format.js";
+
+export class RegionOverlay {
+  // `labels` is the element above the canvas that takes the numbers; onChoose(number) is called when one is activated.
+  constructor(labels, onChoose) {
+    this.labels = labels;
+    this.onChoose = onChoose;
+    this.group = new Group();
+    this.items = [];
+    this.shown = true;
+  }
+
+  set visible(on) {
+    this.shown = on;
+    this.group.visible = on;
+    this.labels.hidden = !on;
+  }
+
+  // `origin` is subtracted: regions come in the part frame, points relative to the session's origin.
+  show(regions, origin, sizeMm) {
+    for (const line of this.group.children) {
+      line.geometry.dispose();
+      line.material.dispose();
+    }
+    this.group.clear();
+    this.items = regions.map((region) => this.#build(region, origin, sizeMm));
+    this.labels.replaceChildren(...this.items.map((item) => item.label));
+  }
+
+  choose(number) {
+    for (const item of this.items) {
+      const chosen = item.region.number === number;
+      item.label.classList.toggle("chosen", chosen);
+      item.front.material.linewidth = chosen ? 4 : 2.5;
+      item.halo.material.linewidth = chosen ? 8 : 5;
+    }
+  }
+
+  #build(region, origin, sizeMm) {
+    const reason = reasonByKey(region.reason);
+    const normal = new Vector3(...(region.normal ?? [0, 0, 1]));
+    if (!(normal.lengthSq() > 0)) normal.set(0, 0, 1);
+    const lift = normal.clone().normalize().multiplyScalar(0.003 * sizeMm); // clear of the points it runs through
+    const place = (point) => [0, 1, 2].map((axis) => point[axis] - origin[axis] + lift.getComponent(axis));
+    const segments = [];
+    for (const ring of region.outline_mm ?? []) {
+      ring.forEach((point, i) => segments.push(...place(point), ...place(ring[(i + 1) % ring.length])));
+    }
+    const line = (options) => {
+      const material = new LineMaterial({ worldUnits: false, ...options });
+      const made = new LineSegments2(new LineSegmentsGeometry().setPositions(segments.length ? segments : [0, 0, 0, 0, 0, 0]), material);
+      made.frustumCulled = false;
+      made.visible = segments.length > 0;
+      this.group.add(made);
+      return made;
+    };
+    // drawn after each other at one depth: a dark halo, the line itself; and a faint trace where the part hides them
+    const behind = line({ color: new Color("#ffffff"), linewidth: 1, transparent: true, opacity: 0.3, depthFunc: GreaterDepth, depthWrite: false });
+    const halo = line({ color: new Color("#05070a"), linewidth: 5, depthWrite: false });
+    const front = line({ color: new Color(reason.colour), linewidth: 2.5, dashed: reason.dash.length > 0 });
+    [halo, front, behind].forEach((made, order) => {
+      made.renderOrder = order + 1;
+    });
+    front.computeLineDistances();
+    const label = document.createElement("button");
+    label.type = "button";
+    label.className = "region-label";
+    label.textContent = String(region.number);
+    label.title = `Region ${region.number}: ${reason.text}`;
+    label.tabIndex = -1; // the list holds the same actions for the keyboard
+    label.addEventListener("click", () => this.onChoose(region.number));
+    return { region, reason, behind, halo, front, label, centre: region.centroid_mm.map((value, axis) => value - origin[axis]), normal };
+  }
+
+  // Dashes and labels have a size on the screen, so they follow the camera.
+  follow(view) {
+    if (!this.shown) return;
+    const resolution = new Vector2(view.width, view.height);
+    const mmPerPixel = 1 / view.pixelsPerMm;
+    const eye = view.camera.position;
+    for (const { front, halo, behind, reason, label, centre, normal } of this.items) {
+      for (const line of [front, halo, behind]) line.material.resolution.copy(resolution);
+      if (reason.dash.length) {
+        front.material.dashSize = reason.dash[0] * mmPerPixel;
+        front.material.gapSize = reason.dash[1] * mmPerPixel;
+      }
+      const at = view.project(centre);
+      const inside = at.visible && at.x > -20 && at.y > -20 && at.x < view.width + 20 && at.y < view.height + 20;
+      label.hidden = !inside;
+      label.style.transform = `translate(${at.x.toFixed(1)}px, ${at.y.toFixed(1)}px) translate(-50%, -50%)`;
+      const facing = normal.x * (eye.x - centre[0]) + normal.y * (eye.y - centre[1]) + normal.z * (eye.z - centre[2]) > 0;
+      label.classList.toggle("behind", !facing);
+    }
+  }
+}

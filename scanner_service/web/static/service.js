@@ -1,0 +1,41 @@
+// The service's REST answers, as this page needs them; shows nothing.
+
+// What the service refused, in its own words (problem details), with the HTTP status; 0 when it did not answer.
+export class ServiceRefusal extends Error {
+  constructor(status, detail) {
+    super(detail);
+    this.status = status;
+  }
+}
+
+const address = (path) => new URL(path, document.baseURI).href; // relative: the page may live under a prefix
+
+async function answer(path, options) {
+  let response;
+  try {
+    response = await fetch(address(path), { credentials: "same-origin", headers: { accept: "application/json" }, ...options });
+  } catch {
+    throw new ServiceRefusal(0, "The service does not answer. Is it running?");
+  }
+  const body = await response.json().catch(() => null);
+  if (response.ok) return body;
+  if (response.status === 401) throw new ServiceRefusal(401, "Not signed in. Open the one-time address that the service printed when it started.");
+  throw new ServiceRefusal(response.status, body?.detail ?? body?.title ?? `The service answered ${response.status}.`);
+}
+
+const sessionPath = (id, rest) => `api/v1/sessions/${encodeURIComponent(id)}/${rest}`;
+
+// {sessions, next}: one page of sessions; `next` is the relative address of the following page, or null.
+export const listSessions = (next = null) => answer(next ?? "api/v1/sessions");
+
+export const startSession = (id) => answer(sessionPath(id, "start"), { method: "POST" });
+
+export const stopSession = (id) => answer(sessionPath(id, "stop"), { method: "POST" });
+
+export const exportAddress = (id, file) => address(sessionPath(id, `export/${file}`));
+
+export function liveAddress(id) {
+  const url = new URL(address(sessionPath(id, "live")));
+  url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
+  return url.href;
+}
