@@ -1,0 +1,223 @@
+"""The verdict on each settled point: good enough or not, and why not; knows no regions, areas or passes.
+
+Two witnesses speak about density. The *count* is Np / (π r²), corrected for the border of the part. The *spacing* is
+the width of the strips to the adjacent scanlines and the distance of the points along the line. A strip that is too
+wide fails unless points of another pass fill it; a low count fails unless the spacing shows that the surface merely
+ends on several sides (a thin rib, a corner).
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
+from scanner_service.analysis.snapshot import MapSnapshot, UInt8Array
+from scanner_service.rescan.border import LEAST_OFFSET, border_aware
+from scanner_service.rescan.gaps import Fan, GapKind, Gaps, near_range_end
+from scanner_service.rescan.noise import noise_along_lines
+from scanner_service.rescan.requirement import Requirement
+from scanner_service.rescan.stations import Stations
+from scanner_service.rescan.strips import Strips
+
+_LOST_GAP = 1.5  # station gaps above this many Δs with missing indices are lost lines
+_SPARSE_GAP = 1.25  # ... without missing indices: moved too fast
+_SLACK = 1.05  # a strip may be this much wider than the required density allows
+_STEEP_RAY = 0.5  # cosine of the incidence beyond which points are too far apart along the line
+
+
+class Reason(IntEnum):
+    """Why a point is worth another pass; NONE where it is good, or not judged."""
+
+    NONE = 0
+    STEEP = 1
+    SPARSE = 2
+    SHADOW = 3
+    OUT_OF_RANGE = 4
+    LOST_LINES = 5
+    NOISY = 6
+    ISOLATED = 7
+
+    @property
+    def label(self) -> str:
+        """The reason as clients see it, lower case."""
+        return self.name.lower()
+
+
+REMEDIES = {
+    Reason.NONE: "none",
+    Reason.STEEP: "another direction",
+    Reason.SPARSE: "the same pass, finer line spacing",
+    Reason.SHADOW: "another side",
+    Reason.OUT_OF_RANGE: "another standoff",
+    Reason.LOST_LINES: "the same pass again",
+    Reason.NOISY: "slower, other exposure or other direction",
+    Reason.ISOLATED: "none: flagged",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """Verdicts, arrays of n rows like the snapshot.
+
+    `judged` is True for settled points that count and whose requirement is known; all others have Reason.NONE.
+    `required_per_mm2` and `judged_per_mm2` are the two sides of the comparison of counts, `spacing_per_mm2` the
+    density that the spacing on the surface gives, 1 / (Δs'·δp) with the widest strip (NaN: unknown). `width_mm` (n, 2)
+    are the strips' widths on the point's own surface (NaN: the surface ends or is unknown there), `failing_strip`
+    (n, 2) the strips that fail. `noise_mm` is the noise along the line (NaN: unknown or not asked for).
+    """
+
+    judged: BoolArray
+    reason: UInt8Array
+    required_per_mm2: Float64Array
+    judged_per_mm2: Float64Array
+    spacing_per_mm2: Float64Array
+    width_mm: Float64Array
+    failing_strip: BoolArray
+    noise_mm: Float64Array
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            read_only(getattr(self, name))
+
+    @property
+    def fails(self) -> BoolArray:
+        """(n,) True where the point is worth another pass."""
+        failing: BoolArray = self.reason != Reason.NONE
+        return failing
+
+
+def judge(
+    snapshot: MapSnapshot,
+    requirement: Requirement,
+    stations: Stations,
+    strips: Strips,
+    fan: Fan,
+    gaps: Gaps,
+    geometry: SensorGeometry | None = None,
+    noise_mm: float | None = None,
+) -> Judgement:
+    """Judge every settled point.
+
+    Parameters
+    ----------
+    snapshot, stations, strips, fan, gaps : the map and what was measured on it.
+    geometry : the scanner's optics; without it no point is `out_of_range`.
+    noise_mm : one standard deviation of the sensor along its ray; None: no point is `noisy`.
+    """
+    line, n = snapshot.line, len(snapshot)
+    required = requirement.per_mm2(strips.line_spacing_mm, strips.nominal_point_spacing_mm)
+    counted_density = border_aware(snapshot.density_per_mm2, snapshot.offset)
+    judged = snapshot.settled & (snapshot.neighbours > 0) & np.isfinite(required)
+
+    wall = np.zeros(n, dtype=bool)
+    flank = np.zeros(n, dtype=bool)
+    for kind, marks in ((GapKind.SHADOW, wall), (GapKind.FLANK, flank)):
+        rows = gaps.of_kind(kind)
+        marks[gaps.high[rows]] = True
+        marks[gaps.low[rows]] = True
+
+    width = _width_on_surface(snapshot, stations, strips, wall & ~flank)
+    allowed = 1.0 / (required * strips.nominal_point_spacing_mm)
+    stride, gap, missing = stations.stride_mm[line], stations.gap_mm[line], stations.missing[line]
+    delta = strips.line_spacing_mm[:, None]
+    lost = (missing > 0) & ~(gap <= _LOST_GAP * delta)
+    fast = ~lost & (gap > _SPARSE_GAP * delta)
+    too_wide = width > _SLACK * allowed[:, None]
+    # beyond this a neighbourhood no longer reaches the next line: Δs'/Δs > sqrt(2) + c/Δs
+    beyond = (width / stride > strips.reach_mm[:, None] / delta) & ~(lost | fast)
+    one_sided = ~(snapshot.offset < LEAST_OFFSET)
+    enough = (snapshot.density_per_mm2 >= required) & ~one_sided
+    failing = ((too_wide & ~enough[:, None]) | beyond) & judged[:, None]
+    filled = _filled(snapshot, strips, failing, np.fmin(allowed, strips.reach_mm))
+    failing &= ~filled
+    width = np.where(filled, np.fmin(width, delta), width)  # what lies further out is the other pass's surface
+
+    with np.errstate(invalid="ignore", divide="ignore"):
+        both = np.isfinite(width).sum(axis=1)
+        mean_width = np.where(both > 0, np.nansum(width, axis=1) / np.maximum(both, 1), np.nan)
+        by_spacing = 1.0 / (mean_width * strips.point_spacing_mm)
+        worst = 1.0 / (np.fmax(width[:, 0], width[:, 1]) * strips.point_spacing_mm)
+    too_few = judged & (counted_density < required) & ~(by_spacing >= required / _SLACK)
+
+    ray = snapshot.points_mm - snapshot.lines.laser_mm[line]
+    incidence = np.abs(np.einsum("ij,ij->i", ray, snapshot.normals)) / np.linalg.norm(ray, axis=1)
+    reason = np.zeros(n, dtype=np.uint8)
+    reason[too_few] = Reason.SPARSE
+    reason[too_few & snapshot.isolated] = Reason.ISOLATED
+    reason[too_few & (flank | (incidence < _STEEP_RAY))] = Reason.STEEP
+    coarse = delta > _SLACK * allowed[:, None]
+    for mask, why in ((~coarse, Reason.STEEP), (coarse, Reason.SPARSE), (beyond, Reason.STEEP)):
+        reason[(failing & mask).any(axis=1)] = why
+    for mask, why in ((fast, Reason.SPARSE), (lost, Reason.LOST_LINES)):
+        reason[(failing & mask).any(axis=1)] = why
+
+    noise = np.full(n, np.nan)
+    if noise_mm is not None:
+        noise = noise_along_lines(snapshot, strips.order)
+        limit = requirement.noise_factor * noise_mm
+        noisy = judged & (reason == Reason.NONE) & (noise > limit) & (snapshot.residual_mm > limit)
+        reason[noisy] = Reason.NOISY
+    if geometry is not None:
+        edge = ~np.isfinite(strips.width_mm).all(axis=1) | _line_ends(snapshot, strips)
+        near = near_range_end(snapshot, stations, strips, fan, geometry)
+        reason[judged & edge & near] = Reason.OUT_OF_RANGE
+    rows = gaps.of_kind(GapKind.OUT_OF_RANGE)
+    reason[np.concatenate([gaps.high[rows], gaps.low[rows]])] = Reason.OUT_OF_RANGE
+    rows = gaps.of_kind(GapKind.SHADOW)
+    ends = np.concatenate([gaps.high[rows], gaps.low[rows]])
+    reason[ends[np.isin(reason[ends], (Reason.NONE, Reason.ISOLATED))]] = Reason.SHADOW
+    # the few returns that a wall gives on its way down are part of it; a rib's top, never a lower end, is not
+    below = gaps.low[rows]
+    reason[below[(reason[below] == Reason.SPARSE) & ~failing[below].any(axis=1)]] = Reason.SHADOW
+    reason[~judged] = Reason.NONE
+    return Judgement(judged, reason, required, counted_density, worst, width, failing, noise)
+
+
+def _width_on_surface(snapshot: MapSnapshot, stations: Stations, strips: Strips, wall: BoolArray) -> Float64Array:
+    """(n, 2) strip widths as far as they belong to the point's own surface.
+
+    A reliable normal tells the width by itself, Δs' = Δs·|t·m| / sqrt(1 - (n·m)²), free of noise; a measured width far
+    beyond it is a jump to another surface, left to the gaps. Without a normal the measured distance stands, except
+    at the ends of a wall.
+    """
+    lines, line = snapshot.lines, snapshot.line
+    width = strips.width_mm.copy()
+    m, t = lines.plane_normal[line], lines.travel[line]
+    sine = np.sqrt(np.maximum(1.0 - np.einsum("ij,ij->i", snapshot.normals, m) ** 2, 1e-12))
+    factor = np.abs(np.einsum("ij,ij->i", m, t)) / sine
+    predicted = stations.stride_mm[line] * factor[:, None]
+    known = np.isfinite(predicted) & np.isfinite(width)
+    far = known & (width > np.maximum(1.5 * predicted, predicted + strips.reach_mm[:, None]))
+    width = np.where(known, np.fmin(predicted, width * 1.02), width)
+    width[far] = np.nan
+    width[wall[:, None] & ~known & (width > strips.reach_mm[:, None])] = np.nan
+    return width
+
+
+def _filled(snapshot: MapSnapshot, strips: Strips, failing: BoolArray, allowed_mm: Float64Array) -> BoolArray:
+    """(n, 2) True where points of other passes lie all along a failing strip, at most half the allowed width away."""
+    filled = np.zeros_like(failing)
+    rows, side = np.nonzero(failing & (strips.link >= 0))
+    groups = np.unique(snapshot.lines.pass_number[snapshot.lines.stationary == np.False_])
+    if not len(rows) or len(groups) < 2:
+        return filled
+    tree = cKDTree(snapshot.points_mm[snapshot.neighbours > 0])
+    start, end = snapshot.points_mm[rows], snapshot.points_mm[strips.link[rows, side]]
+    enough = np.ones(len(rows), dtype=bool)
+    for share in (0.25, 0.5, 0.75):
+        nearest = tree.query(start + share * (end - start))[0]
+        enough &= nearest <= 0.5 * _SLACK * allowed_mm[rows]
+    filled[rows, side] = enough
+    return filled
+
+
+def _line_ends(snapshot: MapSnapshot, strips: Strips) -> BoolArray:
+    """(n,) True for the first and the last return of each scanline."""
+    ends = np.zeros(len(snapshot), dtype=bool)
+    border = np.flatnonzero(np.diff(snapshot.line[strips.order]))
+    ends[strips.order[border]] = True
+    ends[strips.order[border + 1]] = True
+    ends[strips.order[[0, -1]] if len(strips.order) else []] = True
+    return ends

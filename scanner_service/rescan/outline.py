@@ -1,0 +1,110 @@
+"""Outline and area of a patch of surface given by points: an alpha shape; knows no scan and no reason.
+
+The points are triangulated on the plane that fits them best (Delaunay), and a triangle belongs to the patch when its
+circumradius in space is at most the connection length of one of its corners (Edelsbrunner & Mücke 1994, with a length
+for each point, since scanlines are further apart than points). The area is that of the triangles in space. Points that
+no triangle holds stand for a square of the point spacing each, so that a single strand of a scanline has an area.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import Delaunay, QhullError
+
+from drivers.scanline import Float64Array
+from scanner_service.rescan.stations import IntArray
+
+_FLAT = 1e-6  # extents below this share of the longest are no extent: the points are collinear
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """A patch of surface: closed `loops` of (k, 3) points (the last point is not repeated), area, fitted plane.
+
+    `normal` (3,) is the unit normal of the plane without a sign, NaN where the points do not lie near a plane.
+    """
+
+    loops: tuple[Float64Array, ...]
+    area_mm2: float
+    centroid_mm: Float64Array
+    normal: Float64Array
+
+
+def patch_of(points_mm: Float64Array, connection_mm: Float64Array, spacing_mm: Float64Array) -> Patch:
+    """Outline the patch that points (n, 3), n >= 1, form.
+
+    Parameters
+    ----------
+    connection_mm : (n,) how far from each point the surface is taken to go on.
+    spacing_mm : (n,) point spacing, for strands that have no triangle.
+    """
+    centroid = points_mm.mean(axis=0)
+    _, extent, axes = np.linalg.svd(points_mm - centroid, full_matrices=False)
+    half = 0.5 * float(np.median(spacing_mm))
+    normal = np.full(3, np.nan)
+    if len(points_mm) < 3 or extent[1] <= _FLAT * extent[0]:
+        return Patch(*_strand(points_mm, centroid, axes, half), centroid, normal)
+    if extent[2] <= 0.2 * extent[1]:
+        normal = axes[2]
+    try:
+        simplices = Delaunay((points_mm - centroid) @ axes[:2].T).simplices.astype(np.int64)
+    except QhullError:
+        return Patch(*_strand(points_mm, centroid, axes, half), centroid, normal)
+    kept, areas = _kept_triangles(points_mm, simplices, connection_mm)
+    if not len(kept):
+        return Patch(*_strand(points_mm, centroid, axes, half), centroid, normal)
+    alone = np.setdiff1d(np.arange(len(points_mm)), kept)
+    area = float(areas.sum() + (spacing_mm[alone] ** 2).sum())
+    return Patch(tuple(points_mm[loop] for loop in _loops(kept)), area, centroid, normal)
+
+
+def _strand(
+    points_mm: Float64Array, centroid: Float64Array, axes: Float64Array, half_mm: float
+) -> tuple[tuple[Float64Array, ...], float]:
+    """The rectangle around points in a row: their length by one point spacing, half a spacing beyond either end."""
+    along, aside = axes[0], axes[1] if len(axes) > 1 else np.roll(axes[0], 1)
+    aside = aside - along * (aside @ along)
+    aside /= np.linalg.norm(aside)
+    t = (points_mm - centroid) @ along
+    low, high = t.min() - half_mm, t.max() + half_mm
+    corners = [(low, -half_mm), (high, -half_mm), (high, half_mm), (low, half_mm)]
+    return (np.array([centroid + a * along + b * aside for a, b in corners]),), float((high - low) * 2 * half_mm)
+
+
+def _kept_triangles(
+    points_mm: Float64Array, simplices: IntArray, connection_mm: Float64Array
+) -> tuple[IntArray, Float64Array]:
+    """Triangles whose circumradius is within the connection length of a corner, and their areas in space."""
+    a, b, c = (points_mm[simplices[:, k]] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    sides = np.linalg.norm(b - a, axis=1) * np.linalg.norm(c - b, axis=1) * np.linalg.norm(a - c, axis=1)
+    keep = sides <= 4.0 * area * connection_mm[simplices].max(axis=1)
+    return simplices[keep], area[keep]
+
+
+def _loops(triangles: IntArray) -> list[IntArray]:
+    """Closed walks along the edges that belong to one triangle only, each vertex once a visit."""
+    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    base = int(edges.max()) + 1
+    key, back = edges[:, 0] * base + edges[:, 1], edges[:, 1] * base + edges[:, 0]
+    onward: dict[int, list[int]] = {}
+    for start, end in edges[~np.isin(key, back)].tolist():
+        onward.setdefault(start, []).append(end)
+    loops = []
+    while onward:
+        start = next(iter(onward))
+        walk, here = [start], _step(onward, start)
+        while here != start and here in onward:
+            walk.append(here)
+            here = _step(onward, here)
+        loops.append(np.array(walk, dtype=np.int64))
+    return sorted(loops, key=len, reverse=True)
+
+
+def _step(onward: dict[int, list[int]], here: int) -> int:
+    """Take one edge that leaves `here` out of the store, and say where it leads."""
+    ends = onward[here]
+    there = ends.pop()
+    if not ends:
+        del onward[here]
+    return there

@@ -1,0 +1,37 @@
+"""What may be required, and what is refused."""
+
+import numpy as np
+import pytest
+
+from scanner_service.rescan.requirement import Requirement, RequirementUnusable
+
+
+def test_by_default_half_of_the_nominal_density_is_required() -> None:
+    required = Requirement().per_mm2(np.array([0.2, 0.5]), np.array([0.1, np.nan]))
+    np.testing.assert_allclose(required, [25.0, np.nan])
+
+
+def test_a_stated_density_is_required_everywhere() -> None:
+    required = Requirement(density_per_mm2=12.0).per_mm2(np.array([0.2, 0.5]), np.array([0.1, np.nan]))
+    np.testing.assert_allclose(required, [12.0, 12.0])
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("density_per_mm2", 0.0),
+        ("density_per_mm2", -1.0),
+        ("density_per_mm2", float("nan")),
+        ("density_per_mm2", float("inf")),
+        ("density_share", 0.0),
+        ("density_share", 1.5),
+        ("radius_constant_mm", 0.0),
+        ("noise_factor", 0.5),
+        ("region_points", 0),
+        ("region_angle_deg", 0.0),
+        ("search_mm", -2.0),
+    ],
+)
+def test_an_unusable_requirement_is_refused_by_name(field: str, value: float) -> None:
+    with pytest.raises(RequirementUnusable, match=field):
+        Requirement(**{field: value})
