@@ -6,7 +6,7 @@ Every method looks before it writes: a `RecordError` from it has changed nothing
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, delete, func, insert, select, update
@@ -14,7 +14,7 @@ from sqlalchemy import Connection, delete, func, insert, select, update
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.storage.encoding import encode_line
 from scanner_service.storage.errors import SessionDamaged, SessionUnknown
-from scanner_service.storage.rows import EventRow, SessionRow, Stored, Watermark
+from scanner_service.storage.rows import EventRow, SessionRow, Stored
 from scanner_service.storage.tables import (
     events,
     from_json,
@@ -26,6 +26,7 @@ from scanner_service.storage.tables import (
     to_json,
     values_crc,
 )
+from scanner_service.storage.tail import Tail, load_tail
 
 DELETE_SLICE_LINES = 256
 
@@ -48,61 +49,6 @@ class EncodedLine:
         encoded = encode_line(line)
         key = (plain_text(line.device_id, "device id"), line.boot_id, line.line_index, line.pass_index)
         return cls(*key, len(line.index), encoded, zlib.crc32(encoded))
-
-
-@dataclass(slots=True)
-class Tail:
-    """Where a session ends: the next numbers, and per device and boot (in order of arrival) how far it got."""
-
-    next_line: int = 0
-    points: int = 0
-    next_event: int = 0
-    marks: dict[tuple[str, int], Watermark] = field(default_factory=dict)
-    latest_boot: dict[str, int] = field(default_factory=dict)
-
-    def copy(self) -> "Tail":
-        """A tail of its own, so that a failed batch leaves this one as it was."""
-        return replace(self, marks=dict(self.marks), latest_boot=dict(self.latest_boot))
-
-    def watermarks(self) -> dict[str, Watermark]:
-        """Of each device, the watermark of the boot whose line was stored last."""
-        return {device: self.marks[device, boot] for device, boot in self.latest_boot.items()}
-
-    def advance(self, line: EncodedLine) -> None:
-        """Account for one more line."""
-        key = (line.device_id, line.boot_id)
-        mark = self.marks.get(key, Watermark(line.boot_id, line.line_index, line.line_index, 0))
-        highest, first = max(mark.line_index, line.line_index), min(mark.first_index, line.line_index)
-        self.marks[key] = Watermark(line.boot_id, highest, first, mark.line_count + 1)
-        self.latest_boot[line.device_id] = line.boot_id
-        self.next_line += 1
-        self.points += line.points
-
-
-def load_tail(connection: Connection, session_id: str) -> Tail:
-    """Where a session ends, read from the record."""
-    of_session = lines.c.session_id == session_id
-    last = connection.execute(
-        select(lines.c.line_number, lines.c.points, lines.c.points_before)
-        .where(of_session)
-        .order_by(lines.c.line_number.desc())
-        .limit(1)
-    ).first()
-    next_event = select(func.coalesce(func.max(events.c.number) + 1, 0)).where(events.c.session_id == session_id)
-    tail = Tail(next_event=connection.execute(next_event).scalar_one())
-    if last is not None:
-        tail.next_line, tail.points = last.line_number + 1, last.points_before + last.points
-    index = lines.c.line_index
-    boots = connection.execute(
-        select(lines.c.device_id, lines.c.boot_id, func.max(index), func.min(index), func.count())
-        .where(of_session)
-        .group_by(lines.c.device_id, lines.c.boot_id)
-        .order_by(func.max(lines.c.line_number))
-    )
-    for device, boot, highest, first, count in boots:
-        tail.marks[device, boot] = Watermark(boot, highest, first, count)
-        tail.latest_boot[device] = boot
-    return tail
 
 
 class Batch:
@@ -135,7 +81,7 @@ class Batch:
         }
         crc = values_crc({**row, "encoded": line.encoded_crc32})
         self._rows.append({**row, "crc32": crc, "encoded": line.encoded})
-        tail.advance(line)
+        tail.advance(line.device_id, line.boot_id, line.line_index, line.points)
         return Stored(tail.next_line - 1, "stored")
 
     def append_event(self, session_id: str, time_utc: str, kind: str, details: Mapping[str, Any]) -> EventRow:
@@ -184,15 +130,11 @@ class Batch:
         row = self._session(session_id)
         if row.pop("crc32") != row_crc(row):
             raise SessionDamaged(f"session {session_id} fails its checksum and is not changed; its lines are readable")
-        row |= {"state": state, "changed_utc": now_utc}
-        self._update(session_id, row)
-        return session_from(row | {"crc32": row_crc(row)})
+        return session_from(self._update(session_id, row, {"state": state, "changed_utc": now_utc}))
 
     def delete_session(self, session_id: str, now_utc: str) -> None:
         """Hide a session from now on; `delete_slice` takes its rows away, a bounded number at a time."""
-        row = self._session(session_id)
-        row.pop("crc32")
-        self._update(session_id, row | {"deleted_utc": now_utc})
+        self._update(session_id, self._session(session_id), {"deleted_utc": now_utc})
         self.deleted.add(session_id)
 
     def delete_slice(self, session_id: str) -> bool:
@@ -250,9 +192,11 @@ class Batch:
             raise SessionUnknown(f"there is no session {session_id}")
         return row._asdict()
 
-    def _update(self, session_id: str, row: dict[str, Any]) -> None:
-        values = row | {"crc32": row_crc(row)}
-        self._connection.execute(update(sessions).where(sessions.c.session_id == session_id).values(values))
+    def _update(self, session_id: str, row: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+        """Write the changes alone: the other values may be damaged, and the database would not take them back."""
+        changes = changes | {"crc32": row_crc(row | changes)}
+        self._connection.execute(update(sessions).where(sessions.c.session_id == session_id).values(changes))
+        return row | changes
 
 
 def session_from(row: Mapping[str, Any]) -> SessionRow:

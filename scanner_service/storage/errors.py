@@ -69,5 +69,9 @@ class WriteRefused(RecordError):
     """The database refused one value for what it is."""
 
 
+class RecordUnreadable(RecordError):
+    """The database could not answer; what of the record can still be read depends on where it is damaged."""
+
+
 class LineDamaged(RecordError):
     """A stored line fails its checksum, cannot be decoded, or is gone."""

@@ -5,20 +5,21 @@ No read holds a transaction for longer than one chunk, so a slow reader never ke
 
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Select, select
-from sqlalchemy.exc import DatabaseError
+from sqlalchemy import Connection, Select, func, select
+from sqlalchemy.exc import DBAPIError
 
 from scanner_service.analysis.intake import StoredLine
-from scanner_service.storage.batch import load_tail, session_from
+from scanner_service.storage.batch import session_from
 from scanner_service.storage.database import check_identity, reader_engine
 from scanner_service.storage.encoding import decode_line
-from scanner_service.storage.errors import LineDamaged, NotARecord, SessionUnknown
+from scanner_service.storage.errors import LineDamaged, NotARecord, RecordUnreadable, SessionUnknown
 from scanner_service.storage.rows import Count, DamagedLine, EventRow, SessionRow, Verification, Watermark
 from scanner_service.storage.tables import events, from_json, lines, row_crc, sessions
+from scanner_service.storage.tail import load_count, load_tail
 
 _LINES_A_CHUNK = 32
 _EVENTS_A_CHUNK = 256
@@ -73,18 +74,15 @@ class RecordReader:
         return self._events(session_id, after)
 
     def count(self, session_id: str) -> Count:
-        """Lines and points of a session, in constant time; raises SessionUnknown."""
+        """Lines and points of a session; raises SessionUnknown."""
         self.get_session(session_id)
-        query = select(lines.c.line_number, lines.c.points, lines.c.points_before)
-        query = query.where(lines.c.session_id == session_id).order_by(lines.c.line_number.desc()).limit(1)
-        for row in self._rows(query):
-            return Count(row["line_number"] + 1, row["points_before"] + row["points"])
-        return Count(0, 0)
+        with self._connection() as connection:
+            return load_count(connection, session_id)
 
     def watermark(self, session_id: str) -> dict[str, Watermark]:
         """Of each device, how far the boot that stored last is durable; raises SessionUnknown."""
         self.get_session(session_id)
-        with self._engine.connect() as connection:
+        with self._connection() as connection:
             return load_tail(connection, session_id).watermarks()
 
     def lines(
@@ -103,13 +101,35 @@ class RecordReader:
         return self._lines(session_id, max(start, 0), end if stop is None else min(stop, end), on_damage)
 
     def verify(self, session_id: str) -> Verification:
-        """Read every line of a session and say which are damaged."""
+        """Read everything of a session, and the structure of the whole file, and say what is damaged."""
         damaged: list[DamagedLine] = []
+        problems = list(self._structure())
         sound_lines = points = 0
+        if self.get_session(session_id).damaged:
+            problems.append("the session's own row fails its checksum")
         for _, line in self.lines(session_id, on_damage=damaged.append):
             sound_lines += 1
             points += len(line.index)
-        return Verification(Count(sound_lines, points), tuple(damaged))
+        found = list(self.events(session_id))
+        problems += [f"event {event.number} is damaged or gone" for event in found if event.damaged]
+        for table, seen in ((lines, sound_lines + len(damaged)), (events, len(found))):
+            # An expression keeps the database from answering out of an index, whose end may be what is lost.
+            query = (
+                select(func.count().label("count"))
+                .select_from(table)
+                .where(table.c.session_id.concat("") == session_id)
+            )
+            rows = self._rows(query)[0]["count"]
+            if rows != seen:
+                problems.append(f"{rows} {table.name} are in the table, {seen} in its index")
+        return Verification(Count(sound_lines, points), tuple(damaged), tuple(problems))
+
+    def _structure(self) -> Iterator[str]:
+        """What SQLite itself finds wrong with the file; it sees no flipped bit of a value."""
+        with self._connection() as connection:
+            for (message,) in connection.exec_driver_sql("PRAGMA integrity_check"):
+                if message != "ok":
+                    yield str(message)
 
     def _lines(
         self, session_id: str, start: int, stop: int, on_damage: OnDamage | None
@@ -132,7 +152,7 @@ class RecordReader:
         query = select(lines).where(of_session, lines.c.line_number.between(numbers[0], numbers[-1]))
         try:
             found: dict[int, dict[str, Any] | str] = {row["line_number"]: row for row in self._rows(query)}
-        except DatabaseError:  # a page of the file is unreadable: one at a time, so that the others are not lost
+        except RecordUnreadable:  # a page of the file is unreadable: one at a time, so that the others are not lost
             found = {
                 number: self._single(select(lines).where(of_session, lines.c.line_number == number))
                 for number in numbers
@@ -142,21 +162,39 @@ class RecordReader:
     def _single(self, query: Select[Any]) -> dict[str, Any] | str:
         try:
             return next(iter(self._rows(query)), "the line is gone")
-        except DatabaseError as error:
-            return f"the line cannot be read: {error.orig}"
+        except RecordUnreadable as error:
+            return str(error)
 
     def _events(self, session_id: str, after: int) -> Iterator[EventRow]:
+        expected = after + 1
         while True:
             query = select(events).where(events.c.session_id == session_id, events.c.number > after)
             chunk = self._rows(query.order_by(events.c.number).limit(_EVENTS_A_CHUNK))
-            yield from map(_event, chunk)
+            for row in chunk:
+                found = _event(row)
+                if not found.damaged:  # a damaged number tells nothing of what is missing before it
+                    for missing in range(expected, found.number):
+                        yield EventRow(session_id, missing, "", "", 0, {}, damaged=True)
+                    expected = found.number
+                expected += found.number == expected
+                yield found
             if len(chunk) < _EVENTS_A_CHUNK:
                 return
             after = chunk[-1]["number"]
 
     def _rows(self, query: Select[Any]) -> list[dict[str, Any]]:
-        with self._engine.connect() as connection:
+        with self._connection() as connection:
             return [dict(row) for row in connection.execute(query).mappings()]
+
+    @contextmanager
+    def _connection(self) -> Iterator[Connection]:
+        try:
+            with self._engine.connect() as connection:
+                yield connection
+        except DBAPIError as error:
+            raise RecordUnreadable(f"the record cannot be read: {error.orig}") from error
+        except UnicodeDecodeError as error:  # SQLite quotes damaged text in its message
+            raise RecordUnreadable("the record cannot be read: its schema is damaged") from error
 
 
 def _verified(row: dict[str, Any] | str) -> StoredLine:

@@ -81,10 +81,11 @@ class DamagedLine:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """The result of reading every line of a session: sound lines and points, and each damaged line."""
+    """The result of reading all of a session: sound lines and points, each damaged line, and everything else wrong."""
 
     sound: Count
     damaged: tuple[DamagedLine, ...]
+    problems: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,11 +27,12 @@ from sqlalchemy.exc import (
     ProgrammingError,
 )
 
-from scanner_service.storage.batch import Batch, Tail, batch_number, set_batch_number
+from scanner_service.storage.batch import Batch, batch_number, set_batch_number
 from scanner_service.storage.database import PAGE_BYTES, checkpoint
 from scanner_service.storage.errors import RecordBusy, RecordClosed, RecordError, RecordUnusable, WriteRefused
 from scanner_service.storage.rows import Limits, Stored, Watermark, WriterState
 from scanner_service.storage.tables import sessions
+from scanner_service.storage.tail import Tail
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
