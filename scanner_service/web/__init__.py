@@ -12,7 +12,7 @@ INDEX_HTML: Final = STATIC_DIR / "index.html"
 
 # The one inline element of the page: the import map that tells three's add-ons where `three` is. Browsers take no
 # import map from a file, so the policy names this one by its hash; a test compares it with the page.
-IMPORT_MAP_SHA256: Final = "sha256-hRF9bGzhxXvxXxrdYduCXg6SA481n1c0ImXQK3YnL7A="
+IMPORT_MAP_SHA256: Final = "sha256-mHP4EkHlokG1r1jaIXvQCle8I3suYwcwIRznZoVE+zQ="
 
 CONTENT_SECURITY_POLICY: Final = "; ".join(
     (

@@ -1,9 +1,9 @@
 // Rescan regions in the view: outlines on the surface, each reason its own dash, and numbered labels; chooses nothing.
 
 import { Color, GreaterDepth, Group, Vector2, Vector3 } from "three";
-import { LineMaterial } from "./vendor/three/examples/jsm/lines/LineMaterial.js";
-import { LineSegments2 } from "./vendor/three/examples/jsm/lines/LineSegments2.js";
-import { LineSegmentsGeometry } from "./vendor/three/examples/jsm/lines/LineSegmentsGeometry.js";
+import { LineMaterial } from "./vendor/three/addons/lines/LineMaterial.js";
+import { LineSegments2 } from "./vendor/three/addons/lines/LineSegments2.js";
+import { LineSegmentsGeometry } from "./vendor/three/addons/lines/LineSegmentsGeometry.js";
 import { reasonByKey } from "./stream_format.js";
 
 export class RegionOverlay {

@@ -1,7 +1,7 @@
 // The camera, its controls and when to draw; knows a box to look at, but neither points nor regions.
 
 import { Color, MOUSE, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
-import { OrbitControls } from "./vendor/three/examples/jsm/controls/OrbitControls.js";
+import { OrbitControls } from "./vendor/three/addons/controls/OrbitControls.js";
 
 const FIELD_OF_VIEW_DEG = 32;
 const FLIGHT_MS = 320;

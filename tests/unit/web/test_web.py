@@ -65,3 +65,15 @@ def test_decoding_storing_picking_colours_and_reconnection_in_node() -> None:
     ran = subprocess.run([str(NODE), "--test", *files], capture_output=True, text=True, timeout=60, check=False)
     assert ran.returncode == 0, ran.stdout + ran.stderr
     assert int(re.findall(r"pass (\d+)", ran.stdout)[-1]) >= 10, "hardly a test ran"
+
+
+def test_no_file_of_the_page_is_kept_out_of_the_package_by_an_ignore_rule() -> None:
+    root = STATIC_DIR.parents[2]
+    git = shutil.which("git")
+    if git is None or not (root / ".git").exists():
+        pytest.skip("not a git checkout")
+    files = [str(path) for path in STATIC_DIR.rglob("*") if path.is_file()]
+    ran = subprocess.run(
+        [git, "-C", str(root), "check-ignore", "--no-index", *files], capture_output=True, text=True, check=False
+    )
+    assert ran.stdout == ""
