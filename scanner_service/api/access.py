@@ -6,7 +6,7 @@ Errors:
       NotAuthenticated      nothing was shown that says who asks
         KeyMistyped         the key's checksum does not fit
         KeyUnknown          a sound key, but none of this service's
-        SessionUnknown      the cookie is of no session, or of one that ended
+        LoginEnded          the cookie is of no login, or of one that ended
         LoginUnknown        the one-time login was used, is too old, or never existed
       RoleTooLow            known, but may not do this
 
@@ -50,8 +50,8 @@ class KeyUnknown(NotAuthenticated):
     """A sound key, but none of this service's."""
 
 
-class SessionUnknown(NotAuthenticated):
-    """The cookie is of no session, or of one that ended."""
+class LoginEnded(NotAuthenticated):
+    """The cookie is of no login, or of one that ended."""
 
 
 class LoginUnknown(NotAuthenticated):
@@ -63,11 +63,11 @@ class RoleTooLow(AccessError):
 
 
 _CHALLENGE = {"WWW-Authenticate": 'Bearer realm="scanner"'}
-ACCESS_PROBLEMS = {
+ACCESS_PROBLEMS: dict[type[Exception], Problem] = {
     NotAuthenticated: Problem(401, "not-authenticated", "Say who you are", _CHALLENGE),
     KeyMistyped: Problem(401, "key-mistyped", "The key is mistyped", _CHALLENGE),
     KeyUnknown: Problem(401, "key-unknown", "The key is not known here", _CHALLENGE),
-    SessionUnknown: Problem(401, "session-unknown", "Log in again", _CHALLENGE),
+    LoginEnded: Problem(401, "login-ended", "Log in again", _CHALLENGE),
     LoginUnknown: Problem(401, "login-unknown", "The one-time address is not valid", _CHALLENGE),
     RoleTooLow: Problem(403, "role-too-low", "Your role may not do this"),
 }
@@ -228,12 +228,12 @@ class Access:
 
         Raises
         ------
-        SessionUnknown
+        LoginEnded
         """
         with self._lock:
             lent = self._sessions.get(keyring.sha256_of(value))
         if lent is None or lent.expires_s <= self._clock():
-            raise self._refused(SessionUnknown("The browser session has ended; log in again."))
+            raise self._refused(LoginEnded("The login of this browser has ended; log in again."))
         return Identity(lent.role, lent.label, "cookie")
 
     def identify(self, connection: HTTPConnection) -> Identity:

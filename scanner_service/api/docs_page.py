@@ -5,6 +5,7 @@ integrators know, with requests to try. It starts from a script file: no inline 
 """
 
 from collections.abc import Iterable
+from http import HTTPStatus
 from pathlib import Path
 
 from fastapi import APIRouter, Depends, FastAPI
@@ -12,7 +13,8 @@ from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.staticfiles import StaticFiles
 
-from scanner_service.api.problems import Problem
+from scanner_service.api.guard import GUARD_PROBLEMS
+from scanner_service.api.problems import STANDARD_PROBLEMS, Problem, problem_of_status
 from scanner_service.api.scopes import Requirement, Scoped, public
 
 SWAGGER_DIR = Path(__file__).resolve().parent.parent / "web" / "vendor" / "swagger"
@@ -41,11 +43,12 @@ def install_docs(app: FastAPI, problems: Iterable[Problem] = (), requirement: Re
 
     Parameters
     ----------
-    problems : those that `/problems/SLUG` explains.
+    problems : those that `/problems/SLUG` explains, besides the ones of this package and of bare HTTP statuses.
     requirement : who may read the documentation; the program is open, so everyone may by default.
     """
     router = APIRouter(include_in_schema=False, dependencies=[Depends(requirement)])
-    by_slug = {problem.slug: problem for problem in problems}
+    bare = (*(problem_of_status(status) for status in HTTPStatus if status >= 400), *STANDARD_PROBLEMS)
+    by_slug = {problem.slug: problem for problem in (*bare, *GUARD_PROBLEMS, *problems)}
 
     @router.get("/docs")
     async def docs() -> Response:

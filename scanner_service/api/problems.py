@@ -51,7 +51,9 @@ class ProblemRaised(HTTPException):
 
 MALFORMED_JSON = Problem(400, "malformed-json", "The body is not JSON")
 INVALID_REQUEST = Problem(422, "invalid-request", "The request does not fit the schema")
-INTERNAL = Problem(500, "internal-error", "The service failed")
+# The server ends the connection after an unknown error; said beforehand, no client sends its next request into that.
+INTERNAL = Problem(500, "internal-error", "The service failed", {"Connection": "close"})
+STANDARD_PROBLEMS = (MALFORMED_JSON, INVALID_REQUEST, INTERNAL)
 
 
 def problem_document(problem: Problem, detail: str, members: Mapping[str, object] | None = None) -> bytes:

@@ -14,7 +14,7 @@ from starlette.responses import PlainTextResponse
 
 from scanner_service.api.access import ACCESS_PROBLEMS, Access, Identity
 from scanner_service.api.docs_page import install_docs
-from scanner_service.api.guard import GUARD_PROBLEMS, Guard, GuardRules
+from scanner_service.api.guard import Guard, GuardRules
 from scanner_service.api.keys import Role
 from scanner_service.api.login import login_router
 from scanner_service.api.problems import Problem, register_problems
@@ -104,7 +104,7 @@ def small_app(data_dir: Path, clock: Clock | None = None) -> FastAPI:
     app.include_router(login_router())
     app.mount("/open", Scoped(files, public))
     app.mount("/kept", Scoped(files, require(Role.OPERATOR)))
-    install_docs(app, [*GUARD_PROBLEMS, *table.values()])
+    install_docs(app, table.values())
     check_every_route_declares_a_scope(app)
     return app
 

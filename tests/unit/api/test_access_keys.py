@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scanner_service.api.access import Access, KeyMistyped, KeyUnknown, LoginUnknown, SessionUnknown
+from scanner_service.api.access import Access, KeyMistyped, KeyUnknown, LoginEnded, LoginUnknown
 from scanner_service.api.keys import (
     KEYS_FILE,
     LOCAL_KEY_FILE,
@@ -102,7 +102,7 @@ def test_a_revoked_key_and_its_browser_sessions_end(tmp_path: Path) -> None:
     assert not access.revoke_key(key_id)
     with pytest.raises(KeyUnknown):
         access.identify_key(key)
-    with pytest.raises(SessionUnknown):
+    with pytest.raises(LoginEnded):
         access.identify_session(session)
     with pytest.raises(KeyUnknown):
         opened(tmp_path, seed=2).identify_key(key)
@@ -170,19 +170,19 @@ def test_a_browser_session_ends_after_twelve_hours_and_at_logout(tmp_path: Path)
     access = opened(tmp_path, clock)
     one, other = access.open_session(Role.VIEWER, "x"), access.open_session(Role.VIEWER, "x")
     access.close_session(other)
-    with pytest.raises(SessionUnknown):
+    with pytest.raises(LoginEnded):
         access.identify_session(other)
     clock.now_s += 12 * 3600.0 - 1.0
     assert access.identify_session(one).role is Role.VIEWER
     clock.now_s += 1.0
-    with pytest.raises(SessionUnknown):
+    with pytest.raises(LoginEnded):
         access.identify_session(one)
 
 
 def test_sessions_are_bounded_and_the_oldest_ends_first(tmp_path: Path) -> None:
     access = opened(tmp_path)
     values = [access.open_session(Role.VIEWER, "x") for _ in range(1001)]
-    with pytest.raises(SessionUnknown):
+    with pytest.raises(LoginEnded):
         access.identify_session(values[0])
     assert access.identify_session(values[1]).label == "x"
 
