@@ -33,7 +33,7 @@ Happening: TypeAlias = Profile | ScannerEvent
 
 _READ_S = 0.02
 _REOPEN_S = 0.1
-_ENTER_S = 6.0
+_ENTER_S = 4.0
 _STALL_S = 1.0
 _EXIT_S = 1.0
 _END_S = 5.0
