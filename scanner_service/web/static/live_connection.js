@@ -6,9 +6,9 @@ const LONGEST_PAUSE_MS = 15000;
 const QUIET_MS = 5000; // a scanning session speaks about twice a second
 const DEAD_MS = 20000;
 // closings that a new attempt cannot mend, by WebSocket close code (docs/live-stream.md)
-const FINAL_CLOSINGS = { 1000: "finished", 4401: "signed-out", 4404: "absent" };
+const FINAL_CLOSINGS = { 1000: "finished", 4404: "absent" };
 
-// States told to onState({state, ...}): connecting, open, quiet, waiting {seconds, attempt}, finished, signed-out, absent, closed.
+// States told to onState({state, ...}): connecting, open, quiet, waiting {seconds, attempt}, finished, absent, closed.
 export class LiveConnection {
   #socket = null;
   #timer = null;

@@ -13,7 +13,7 @@ import { RegionOverlay } from "./region_overlay.js";
 import { SceneView } from "./scene_view.js";
 import { exportAddress, listSessions, startSession, stopSession } from "./service.js";
 import { SessionPicker } from "./session_picker.js";
-import { OVER, SCANNING, SessionView } from "./session_view.js";
+import { OVER, SessionView } from "./session_view.js";
 
 const SURVEY_MS = 1000;
 const CLICK_SLACK_PX = 4;
@@ -58,7 +58,7 @@ function status() {
   state.textContent = words(told.state);
   state.dataset.state = told.state;
   byId("stop").hidden = OVER.has(told.state) || told.state === "created";
-  byId("start").hidden = OVER.has(told.state) || SCANNING.has(told.state);
+  byId("start").hidden = told.state !== "created";
   byId("stop-note").hidden = byId("stop").hidden;
   const progress = byId("progress");
   progress.hidden = told.progress === null || told.progress === undefined;
@@ -85,7 +85,6 @@ function connection({ state, seconds, attempt, reason }) {
     quiet: `No word from the service for ${seconds} s`,
     waiting: `Connection lost. Trying again in ${Math.max(1, Math.round(seconds))} s`,
     finished: "Finished",
-    "signed-out": "Not signed in",
     absent: "No such session",
     closed: "Closed",
   };
@@ -96,7 +95,6 @@ function connection({ state, seconds, attempt, reason }) {
   byId("view").classList.toggle("stale", state === "waiting" || state === "connecting" || state === "quiet");
   if (state === "open") say(session.status?.message ?? "");
   if (state === "absent") notice(reason || "There is no such session.");
-  if (state === "signed-out") say("Not signed in. Open the one-time address that the service printed when it started.");
   if (state === "waiting") listSessions().catch((refusal) => say(refusal.message)); // it may say why
 }
 

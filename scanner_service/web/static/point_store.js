@@ -59,9 +59,9 @@ export class PointStore {
     const oneRun = n > 0 && ids[n - 1] - ids[0] === n - 1 && isRun(ids);
     if (oneRun) this.#takeRun(ids[0], n, message);
     else this.#takeScattered(message);
+    if (message.version !== this.version) this.skipped += message.skipped; // once, however many parts a version came in
     this.version = message.version;
     this.total = message.total;
-    this.skipped += message.skipped;
   }
 
   #takeRun(first, n, { xyz, density, normal, state }) {

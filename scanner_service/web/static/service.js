@@ -25,8 +25,8 @@ async function answer(path, options) {
 
 const sessionPath = (id, rest) => `api/v1/sessions/${encodeURIComponent(id)}/${rest}`;
 
-// {sessions, next}: one page of sessions; `next` is the relative address of the following page, or null.
-export const listSessions = (next = null) => answer(next ?? "api/v1/sessions");
+// {sessions, next}: one page of sessions; `next` goes into `after` for the following page, null when there is none.
+export const listSessions = (after = null) => answer(`api/v1/sessions${after === null ? "" : `?after=${encodeURIComponent(after)}`}`);
 
 export const startSession = (id) => answer(sessionPath(id, "start"), { method: "POST" });
 

@@ -6,8 +6,8 @@ import { PointStore, VersionGap } from "./point_store.js";
 import { liveAddress } from "./service.js";
 import { decodeMessage, KIND_POINTS, StreamDamage } from "./stream_format.js";
 
-export const SCANNING = new Set(["starting", "scanning", "running", "resuming"]);
-export const OVER = new Set(["stopped", "closed", "finished", "failed", "deleted"]);
+export const SCANNING = new Set(["scanning"]);
+export const OVER = new Set(["stopped", "failed", "interrupted"]);
 
 export class SessionView {
   store = new PointStore();

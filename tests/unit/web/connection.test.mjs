@@ -81,7 +81,7 @@ test("chance shortens a pause by a quarter at most", () => {
   assert.equal(made.states.at(-1).seconds, 0.375);
 });
 
-for (const [code, state] of [[1000, "finished"], [4401, "signed-out"], [4404, "absent"]]) {
+for (const [code, state] of [[1000, "finished"], [4404, "absent"]]) {
   test(`closing ${code} is final: ${state}`, () => {
     const made = scene();
     lose(made.accept(), code);

@@ -66,6 +66,15 @@ test("a kind of a later version is left alone", () => {
   assert.deepEqual(decodeMessage(message([], { kind: 7 })), { kind: 7 });
 });
 
+test("a version that comes in parts is held when its last part is there, and its skipped versions count once", () => {
+  const store = new PointStore(4);
+  take(store, run(0, 5), { version: 0, base: 0, snapshot: true, total: 12, skipped: 3 });
+  take(store, run(5, 10), { version: 0, base: 0, total: 12, skipped: 3 });
+  assert.deepEqual([store.version, store.received, store.skipped], [0, 10, 0]);
+  take(store, run(10, 12), { version: 7, base: 0, total: 12, skipped: 3 });
+  assert.deepEqual([store.version, store.received, store.total, store.skipped], [7, 12, 12, 3]);
+});
+
 test("however a map is cut into messages, the store holds the same", () => {
   const whole = new PointStore(4);
   take(whole, run(0, 100), { snapshot: true });
