@@ -1,1 +1,48 @@
-"""The composition root: reads settings and wires everything."""
+"""The composition root of the command line: which commands there are; the bare command serves."""
+
+from typing import Annotated
+
+import typer
+
+from scanner_service import __version__
+from scanner_service.commands.analyse import analyse_command
+from scanner_service.commands.demo import demo_command
+from scanner_service.commands.replay import replay_command
+from scanner_service.commands.serve import DEFAULT_DATA, serve_command
+from scanner_service.commands.simulate import simulate_command
+
+app = typer.Typer(
+    name="scanner",
+    help="Live quality for laser-line scanning: density, normals, and what to scan again.",
+    no_args_is_help=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+app.command("serve")(serve_command)
+app.command("demo")(demo_command)
+app.command("replay")(replay_command)
+app.command("analyse")(analyse_command)
+app.command("simulate")(simulate_command)
+
+
+def _tell_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def bare(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_tell_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Without a command: serve with the defaults."""
+    if context.invoked_subcommand is None:
+        serve_command(DEFAULT_DATA)
+
+
+def main() -> None:
+    """The `scanner` command."""
+    app()

@@ -10,6 +10,7 @@ from scanner_service import __version__, web
 from scanner_service.analysis.errors import MapFull
 from scanner_service.api.access import ACCESS_PROBLEMS
 from scanner_service.api.docs_page import install_docs
+from scanner_service.api.errors import ExportUnknown, ValueUnusable
 from scanner_service.api.guard import Guard, GuardRules
 from scanner_service.api.login import login_router
 from scanner_service.api.origins import Allowlist
@@ -17,8 +18,10 @@ from scanner_service.api.problems import Problem, ProblemTable, register_problem
 from scanner_service.api.routes import health, live, results, scanlines, sessions
 from scanner_service.api.scopes import Scoped, check_every_route_declares_a_scope, public
 from scanner_service.api.service import Service
+from scanner_service.rescan.requirement import RequirementUnusable
 from scanner_service.sessions.errors import LineRefused, SessionBusy, SessionError, SessionNotLive, SourceUnusable
 from scanner_service.storage.errors import RecordBusy, RecordError, SessionUnknown
+from scanner_service.storage.exports.errors import ExportError
 from scanner_service.storage.formats.errors import FormatError
 
 SESSION_PROBLEMS: ProblemTable = {
@@ -36,18 +39,23 @@ SESSION_PROBLEMS: ProblemTable = {
     MapFull: Problem(507, "map-full", "The live map is full"),
     RecordBusy: Problem(503, "record-busy", "The record cannot take more now"),
     RecordError: Problem(500, "record-error", "The record failed"),
-    LookupError: Problem(404, "not-found", "Not Found"),
-    ValueError: Problem(422, "invalid-value", "A value cannot be used"),
+    RequirementUnusable: Problem(422, "requirement-unusable", "No scan could be judged by this"),
+    ValueUnusable: Problem(422, "invalid-value", "A value cannot be used"),
+    ExportUnknown: Problem(404, "export-unknown", "There is no such export"),
+    ExportError: Problem(507, "export-failed", "The file could not be written"),
 }
-PUSH_BODY_BYTES = 16 << 20
+PUSH_BODY_BYTES = 4 << 20
 
 
 def make_app(service: Service, allowlist: Allowlist | None = None) -> ASGIApp:
     """The guarded application of a service; raises ScopeUndeclared when a route does not say who may use it."""
-    app = FastAPI(title="scanner", version=__version__, docs_url=None, redoc_url=None, openapi_url=None)
+    app = FastAPI(
+        title="scanner", version=__version__, docs_url=None, redoc_url=None, openapi_url=None, redirect_slashes=False
+    )
     app.state.service = service
     app.state.access = service.access
-    problems: dict[type[Exception], Problem] = {**ACCESS_PROBLEMS, **SESSION_PROBLEMS}
+    problems: dict[type[Exception], Problem] = dict(SESSION_PROBLEMS)
+    problems.update(ACCESS_PROBLEMS)
     register_problems(app, problems)
     install_docs(app, problems.values())
     app.include_router(login_router())

@@ -4,7 +4,7 @@ import math
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from drivers.scanline import Float64Array, Scanline
 from scanner_service.sessions.settings import SessionSettings
@@ -91,8 +91,15 @@ class ScanlineIn(_Strict):
     line_spacing_mm: Annotated[float, Field(gt=0, allow_inf_nan=False)]
     step_mm: Finite | None = None
 
+    @field_validator("plane_normal", "travel")
+    @classmethod
+    def _has_a_length(cls, vector: Vector | None) -> Vector | None:
+        if vector is not None and not math.hypot(*vector) > 1e-9:
+            raise ValueError("a direction must have a length; leave it out when it is not known")
+        return vector
+
     def to_scanline(self) -> Scanline:
-        """As the session takes it; raises ValueError when a direction has no length."""
+        """As the session takes it."""
         unknown = (math.nan, math.nan, math.nan)
         points = np.array([unknown if point is None else point for point in self.points_mm], dtype=np.float64)
         return Scanline(
@@ -104,8 +111,8 @@ class ScanlineIn(_Strict):
             points_mm=points.reshape(-1, 3),
             missing=np.zeros(len(points), dtype=np.bool_),
             laser_mm=np.array(self.laser_mm),
-            plane_normal=_unit("plane_normal", self.plane_normal),
-            travel=_unit("travel", self.travel),
+            plane_normal=_unit(self.plane_normal),
+            travel=_unit(self.travel),
             position_mm=math.nan if self.position_mm is None else self.position_mm,
             line_spacing_mm=self.line_spacing_mm,
             step_mm=math.nan if self.step_mm is None else self.step_mm,
@@ -118,11 +125,10 @@ class ScanlinesIn(_Strict):
     lines: Annotated[list[ScanlineIn], Field(min_length=1, max_length=256)]
 
 
-def _unit(name: str, vector: Vector | None) -> Float64Array:
+def _unit(vector: Vector | None) -> Float64Array:
+    """The direction at length 1; NaN when it is not known."""
     if vector is None:
         return np.full(3, np.nan)
     direction = np.array(vector)
-    length = float(np.linalg.norm(direction))
-    if not length > 1e-9:
-        raise ValueError(f"{name} must have a length; leave it out when it is not known")
-    return direction / length
+    unit: Float64Array = direction / math.hypot(*vector)
+    return unit

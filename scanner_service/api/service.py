@@ -41,7 +41,7 @@ class Service:
         record = Record.open(data_dir / "record.sqlite")
         try:
             book = SessionBook(record)
-            access = Access.open(data_dir, time.time, secrets.token_bytes)
+            access = Access.open(data_dir, time.monotonic, secrets.token_bytes)
         except BaseException:
             record.close()
             raise

@@ -32,7 +32,7 @@ _RECORD_PATIENCE_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    line: Scanline
+    line: Scanline | StoredLine
     reply: "Future[Stored] | None"
 
 
@@ -78,8 +78,8 @@ class Engine:
             self._thread.join()
         self._refuse_the_rest()
 
-    def put(self, line: Scanline, reply: "Future[Stored] | None" = None) -> None:
-        """Hand over a scanline; waits while the inbox is full, so that the source and not the engine holds it."""
+    def put(self, line: Scanline | StoredLine, reply: "Future[Stored] | None" = None) -> None:
+        """Hand over a scanline, or one out of a record; waits while the inbox is full, so that the source holds it."""
         if self.failure is not None or not self._thread.is_alive():
             raise SessionNotLive(self.failure or "the session is closed and takes no scanlines")
         self.ledger.arrived()
@@ -147,11 +147,13 @@ class Engine:
 
     def _take(self, message: _Line) -> None:
         """One scanline: quantise, record, map; the commit is not waited for."""
-        try:
-            line = quantise(message.line, self.live_map.origin_mm)
-        except ValueError as error:
-            self._refuse(message, "invalid", str(error))
-            return
+        line = message.line
+        if not isinstance(line, StoredLine):
+            try:
+                line = quantise(line, self.live_map.origin_mm)
+            except ValueError as error:
+                self._refuse(message, "invalid", str(error))
+                return
         key = (line.device_id, line.boot_id, line.line_index)
         if key not in self._seen:
             self._close_pass_before(line)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from drivers.scanline import Scanline
+from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.warm_up import warm_up
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionBusy, SessionError
@@ -149,7 +150,7 @@ class LiveSession:
 
     # -- what a source says (Sink) ------------------------------------------------------------------------------
 
-    def line(self, line: Scanline) -> None:
+    def line(self, line: Scanline | StoredLine) -> None:
         """A scanline from the source; lines that come when the engine is gone are counted by it."""
         try:
             self.engine.put(line)

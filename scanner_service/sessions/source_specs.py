@@ -9,8 +9,9 @@ from drivers.rig import Rig
 from drivers.scanners.native import NativeScanner
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.sources import DeviceSource, PassRequest, PushSource, ReplaySource, Source
-from scanner_service.storage.formats import FormatError, open_recording
-from scanner_service.storage.formats.recording import ReadOptions
+from scanner_service.storage.formats import ReadOptions, Recording, open_recording
+from scanner_service.storage.reader import RecordReader
+from scanner_service.storage.rows import SessionRow
 
 _PORT_PREFIXES = ("/dev/tty", "/dev/pts/", "/dev/serial/", "/dev/cu.")
 
@@ -60,18 +61,49 @@ class ReplaySpec:
     options: ReadOptions
     speed: float | None = None
 
-    def open(self) -> Source:
-        """Read the file; raises SourceUnusable when it cannot be understood."""
+    def read(self) -> Recording:
+        """Read the file; raises FormatError when it cannot be understood."""
+        return open_recording(self.file, self.options)
+
+    def open(self, recording: Recording | None = None) -> Source:
+        """A source that plays the file, or the recording that was read from it; raises FormatError, SourceUnusable."""
         if self.speed is not None and not (math.isfinite(self.speed) and self.speed > 0):
             raise SourceUnusable(f"the speed of a replay must be greater than 0, not {self.speed}")
-        try:
-            return ReplaySource(open_recording(self.file, self.options), self.speed)
-        except (FormatError, OSError) as error:
-            raise SourceUnusable(str(error)) from error
+        recording = recording or self.read()
+        accounts = {"points_declared": recording.points_declared, "dropped": dict(recording.dropped)}
+        return ReplaySource(recording.lines, len(recording.lines), accounts, self.speed)
 
     def to_dict(self) -> dict[str, Any]:
         """As it is kept in the record."""
         return {"kind": "replay", "file": self.file.name, "speed": self.speed}
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSpec:
+    """A session of a record, its own or another service's; played again it gives the same answers bit for bit."""
+
+    reader: RecordReader
+    session: SessionRow
+    speed: float | None = None
+
+    @classmethod
+    def find(cls, reader: RecordReader, session_id: str | None, speed: float | None = None) -> "RecordSpec":
+        """The session of that id, or the newest; raises SessionUnknown, or SourceUnusable for an empty record."""
+        if session_id is not None:
+            return cls(reader, reader.get_session(session_id), speed)
+        newest = reader.list_sessions(1)
+        if not newest:
+            raise SourceUnusable("the record holds no session to replay")
+        return cls(reader, newest[0], speed)
+
+    def open(self) -> Source:
+        """A source that plays the stored lines as they are."""
+        lines = (line for _, line in self.reader.lines(self.session.session_id))
+        return ReplaySource(lines, self.reader.count(self.session.session_id).lines, None, self.speed)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it is kept in the record."""
+        return {"kind": "record", "session": self.session.session_id}
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,4 +119,4 @@ class PushSpec:
         return {"kind": "push"}
 
 
-SourceSpec = DeviceSpec | ReplaySpec | PushSpec
+SourceSpec = DeviceSpec | ReplaySpec | RecordSpec | PushSpec

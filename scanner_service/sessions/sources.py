@@ -6,7 +6,7 @@ A source runs its own thread and hands frozen scanlines to a `Sink`; it knows no
 import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -23,15 +23,16 @@ from drivers.protocols.scanner_events import (
 from drivers.rig import Rig
 from drivers.scanline import DeviceInfo, Profile, Scanline, SensorGeometry
 from drivers.scanners.native import Happening, NativeScanner
+from scanner_service.analysis.intake import StoredLine
 from scanner_service.sessions.errors import SourceUnusable
-from scanner_service.storage.formats.recording import Recording
+from scanner_service.storage.errors import RecordError
 
 
 class Sink(Protocol):
     """What a source may tell its session."""
 
-    def line(self, line: Scanline) -> None:
-        """A scanline; waits while the session is busy."""
+    def line(self, line: Scanline | StoredLine) -> None:
+        """A scanline, or one out of a record; waits while the session is busy."""
 
     def note(self, kind: str, details: dict[str, Any]) -> None:
         """Something happened: `interrupted`, `reconnected`, `resumed`, `not_resumed`, `rebooted`, `pass_ended`."""
@@ -151,17 +152,23 @@ class DeviceSource:
 
 
 class ReplaySource:
-    """A recorded scan, played as fast as it is taken or at `speed` times the pace of its device times."""
+    """Recorded scanlines, played as fast as they are taken or at `speed` times the pace of their device times.
+
+    `accounts` is what the file held and what of it could not be used, `line_count` how many lines there are.
+    """
 
     def __init__(
         self,
-        recording: Recording,
+        lines: Iterable[Scanline] | Iterable[StoredLine],
+        line_count: int,
+        accounts: dict[str, Any] | None = None,
         speed: float | None = None,
         clock: Callable[[], float] = time.monotonic,
-        geometry: SensorGeometry | None = None,
     ) -> None:
-        self.geometry = geometry
-        self._recording = recording
+        self.geometry: SensorGeometry | None = None
+        self._lines = lines
+        self._line_count = line_count
+        self._accounts = accounts
         self._speed = speed
         self._clock = clock
         self._played = 0
@@ -181,25 +188,29 @@ class ReplaySource:
 
     def tally(self) -> dict[str, Any] | None:
         """What the file held, and what of it could not be used."""
-        recording = self._recording
-        return {"points_declared": recording.points_declared, "dropped": dict(recording.dropped)}
+        return self._accounts
 
     def progress(self) -> float | None:
         """Share of the lines that were played."""
-        return self._played / len(self._recording.lines) if self._recording.lines else 1.0
+        return self._played / self._line_count if self._line_count else 1.0
 
     def _play(self, sink: Sink) -> None:
         begun_s = self._clock()
-        first_s = self._recording.lines[0].device_time_s if self._recording.lines else 0.0
-        for line in self._recording.lines:
-            if self._speed is not None:
-                due_s = (line.device_time_s - first_s) / self._speed
-                self._stopping.wait(max(0.0, due_s - (self._clock() - begun_s)))
-            if self._stopping.is_set():
-                break
-            sink.line(line)
-            self._played += 1
-        sink.ended(None)
+        first_s: float | None = None
+        failure: str | None = None
+        try:
+            for line in self._lines:
+                first_s = line.device_time_s if first_s is None else first_s
+                if self._speed is not None:
+                    due_s = (line.device_time_s - first_s) / self._speed
+                    self._stopping.wait(max(0.0, due_s - (self._clock() - begun_s)))
+                if self._stopping.is_set():
+                    break
+                sink.line(line)
+                self._played += 1
+        except RecordError as error:
+            failure = str(error)
+        sink.ended(failure)
 
 
 class SpentSource:

@@ -1,19 +1,23 @@
 """What a session found out: points, density map, rescan regions, summary and the files to take away."""
 
 import math
+import shutil
+import tempfile
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Query
+from starlette.background import BackgroundTask
 from starlette.responses import FileResponse, Response
 
-from scanner_service import __version__
 from scanner_service.analysis.snapshot import RadiusRule, Unreliable
 from scanner_service.api.answers import answer
+from scanner_service.api.errors import ExportUnknown, ValueUnusable
 from scanner_service.api.routes.sessions import Session, viewer
 from scanner_service.rescan.judgement import Reason
-from scanner_service.sessions.outputs import OUTPUT_FILES, export_file
-from scanner_service.sessions.results import Results, summarise
+from scanner_service.sessions.outputs import OUTPUT_FILES, summary_of, write_output
+from scanner_service.sessions.results import Results
 from scanner_service.sessions.session import LiveSession
 from scanner_service.storage.exports.density_png import density_png
 
@@ -74,7 +78,7 @@ def density_map_picture(
     """The density map as a picture, seen along the direction given (from above by default)."""
     direction = np.array([along_x, along_y, along_z])
     if not math.isclose(float(np.linalg.norm(direction)), 1.0, abs_tol=1e-3):
-        raise ValueError("along_x, along_y and along_z must be the parts of a direction of length 1")
+        raise ValueUnusable("along_x, along_y and along_z must be the parts of a direction of length 1")
     results = results_of(session)
     picture = density_png(
         results.snapshot,
@@ -96,18 +100,24 @@ def list_regions(session: Session) -> Response:
 @router.get("/summary")
 def get_summary(session: Session) -> Response:
     """What summary.json holds."""
-    return answer(summarise(results_of(session), session.losses(), session.status().points_per_s, __version__))
+    return answer(summary_of(session, results_of(session)))
 
 
 @router.get("/export/{file_name}")
 def export(session: Session, file_name: str) -> Response:
     """One of the files points.ply, density.png, regions.json, summary.json."""
     if file_name not in OUTPUT_FILES:
-        raise LookupError(f"there is no export {file_name}; ask for one of {', '.join(OUTPUT_FILES)}")
-    made = export_file(file_name, session, results_of(session))
+        raise ExportUnknown(f"there is no export {file_name}; ask for one of {', '.join(OUTPUT_FILES)}")
+    folder = Path(tempfile.mkdtemp(prefix="scanner-export-"))
+    forget = BackgroundTask(shutil.rmtree, folder)
+    try:
+        write_output(file_name, folder / file_name, session, results_of(session))
+    except BaseException:
+        shutil.rmtree(folder)
+        raise
     return FileResponse(
-        made.path,
-        media_type=MEDIA_TYPES[made.path.suffix],
+        folder / file_name,
+        media_type=MEDIA_TYPES[Path(file_name).suffix],
         filename=f"{session.row.session_id}-{file_name}",
-        background=made.forget,
+        background=forget,
     )

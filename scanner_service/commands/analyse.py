@@ -1,0 +1,81 @@
+"""`scanner analyse`: density and normals of a plain cloud that has no scanlines."""
+
+from pathlib import Path
+from typing import Annotated, cast, get_args
+
+import numpy as np
+import typer
+
+from scanner_service import __version__
+from scanner_service.analysis.cloud import CloudRule, analyse_cloud
+from scanner_service.commands.options import parse_position, parse_units
+from scanner_service.commands.terminal import console, errors, plain_errors, show_json
+from scanner_service.rescan.requirement import Requirement
+from scanner_service.sessions.results import judge, summarise
+from scanner_service.storage.exports.density_png import density_png
+from scanner_service.storage.exports.points_ply import write_points_ply
+from scanner_service.storage.exports.results_json import write_json
+from scanner_service.storage.exports.whole_file import write_whole
+from scanner_service.storage.formats import ReadOptions, open_cloud
+
+
+def analyse_command(
+    file: Annotated[Path, typer.Argument(help="PLY, XYZ or CSV.")],
+    out: Annotated[Path, typer.Option(help="Folder for the result files.")] = Path("out"),
+    radius: Annotated[float | None, typer.Option(help="One radius in mm for all points.")] = None,
+    rule: Annotated[str | None, typer.Option(help="fixed, flexible (20 points each) or global (median).")] = None,
+    units: Annotated[str | None, typer.Option(help="Length unit of the file: mm, m, inch or auto.")] = None,
+    max_radius: Annotated[float | None, typer.Option(help="Largest radius in mm; 2 by default.")] = None,
+    seen_from: Annotated[str | None, typer.Option(help="x,y,z in mm that normals are turned to.")] = None,
+    density: Annotated[float | None, typer.Option(help="Required points per mm².")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Analyse a cloud with a given radius or one of the chapter's rules, and write the result files."""
+    with plain_errors():
+        chosen = _rule(rule, radius)
+        cloud = open_cloud(file, ReadOptions(parse_units(units)))
+        position = parse_position(seen_from)
+        with errors.status("computing density and normals …"):
+            found = analyse_cloud(
+                cloud.points_mm,
+                chosen,
+                radius_mm=radius,
+                max_radius_mm=max_radius,
+                seen_from_mm=None if position is None else np.array(position),
+            )
+        notes = (*cloud.notes, *found.notes)
+        for note in notes:
+            errors.print(f"note: {note}", highlight=False, soft_wrap=True)
+        results = judge(found.snapshot, Requirement(density_per_mm2=density), None)
+        losses = {"points": {"declared": cloud.points_declared, "dropped": dict(cloud.dropped) | found.dropped}}
+        summary = {"name": file.name} | summarise(results, losses, float("nan"), __version__, notes)
+        out.mkdir(parents=True, exist_ok=True)
+        write_points_ply(out / "points.ply", results.snapshot, results.verdict.rescan, version=__version__)
+        write_whole(
+            out / "density.png",
+            density_png(results.snapshot, results.report.regions, name=file.name, coverage=results.coverage.share),
+        )
+        write_json(out / "regions.json", results.report.to_dict())
+        write_json(out / "summary.json", summary)
+        if as_json:
+            show_json(summary)
+            return
+        median = summary["density_per_mm2"]["median"]
+        console.print(
+            f"{len(results.snapshot):,} points, radius {summary['radius_mm']['median']:.3f} mm, density "
+            f"{median:.2f} points/mm², {summary['reliable_share']:.1%} with a reliable normal",
+            highlight=False,
+        )
+        console.print(f"Written to {out}: points.ply, density.png, regions.json, summary.json", highlight=False)
+
+
+def _rule(rule: str | None, radius: float | None) -> CloudRule:
+    """The rule asked for; a radius alone means `fixed`, nothing means `global`."""
+    if rule is None:
+        return "fixed" if radius is not None else "global"
+    if rule != "fixed" and radius is not None:
+        raise ValueError(f"a radius is given and the rule is {rule}: leave one of them out")
+    for known in get_args(CloudRule):
+        if rule == known:
+            return cast(CloudRule, known)
+    raise ValueError(f"the rule must be fixed, flexible or global, not {rule}")

@@ -1,0 +1,23 @@
+"""Options that several commands read in the same way; raises ValueError with one plain sentence."""
+
+from typing import cast, get_args
+
+from scanner_service.storage.formats.recording import Units
+
+
+def parse_units(text: str | None) -> Units | None:
+    """A length unit: mm, m, inch or auto; None stays None."""
+    if text is None or text in get_args(Units):
+        return cast(Units | None, text)
+    raise ValueError(f"units must be mm, m, inch or auto, not {text}")
+
+
+def parse_position(text: str | None) -> tuple[float, float, float] | None:
+    """A position `x,y,z` in mm, in which `-` stands for a coordinate left open (NaN); None stays None."""
+    if text is None:
+        return None
+    try:
+        x, y, z = (float("nan") if part.strip() == "-" else float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"a position is three numbers x,y,z in mm, not {text}") from None
+    return (x, y, z)

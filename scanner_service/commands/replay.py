@@ -1,0 +1,120 @@
+"""`scanner replay`: a recorded scan through the same pipeline, and the same files as from a live one."""
+
+import contextlib
+import math
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from scanner_service.commands.options import parse_position, parse_units
+from scanner_service.commands.terminal import (
+    console,
+    errors,
+    plain_errors,
+    regions_table,
+    scan_progress,
+    show_json,
+)
+from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.outputs import OUTPUT_FILES, write_outputs
+from scanner_service.sessions.session import LiveSession
+from scanner_service.sessions.settings import SessionSettings
+from scanner_service.sessions.source_specs import RecordSpec, ReplaySpec
+from scanner_service.storage.formats.recording import ReadOptions
+from scanner_service.storage.reader import RecordReader
+from scanner_service.storage.record import Record
+
+
+def replay_command(
+    file: Annotated[Path, typer.Argument(help="PLY with a range_grid, CSV profiles, or a record of this service.")],
+    out: Annotated[Path, typer.Option(help="Folder for the result files.")] = Path("out"),
+    units: Annotated[str | None, typer.Option(help="Length unit of the file: mm, m, inch or auto.")] = None,
+    line_spacing: Annotated[float | None, typer.Option(help="Line spacing in mm; derived when not given.")] = None,
+    laser: Annotated[str | None, typer.Option(help="Laser position x,y,z in mm; an open coordinate is `-`.")] = None,
+    plain_radius: Annotated[
+        bool, typer.Option("--plain-radius", help="Ignore the point spacing (plain Eq. 6.3).")
+    ] = False,
+    density: Annotated[float | None, typer.Option(help="Required points per mm²; half the nominal by default.")] = None,
+    noise: Annotated[float, typer.Option(min=0, help="The scanner's noise in mm, one standard deviation.")] = 0.0,
+    speed: Annotated[float | None, typer.Option(help="Times real time; as fast as possible by default.")] = None,
+    session: Annotated[str | None, typer.Option(help="Which session of a record; the newest by default.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Keep the replayed session in this record file.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+) -> None:
+    """Replay a recorded scan and write points.ply, density.png, regions.json and summary.json."""
+    with plain_errors(), tempfile.TemporaryDirectory(prefix="scanner-replay-") as folder:
+        with Record.open(record or Path(folder) / "record.sqlite") as opened, contextlib.ExitStack() as stack:
+            spec: RecordSpec | ReplaySpec
+            if is_record(file):
+                reader = RecordReader.open(file)
+                stack.callback(reader.close)
+                spec = RecordSpec.find(reader, session, speed)
+                source, settings, origin_mm = (
+                    spec.open(),
+                    SessionSettings.from_dict(spec.session.settings),
+                    spec.session.origin_mm,
+                )
+            else:
+                spec = ReplaySpec(file, ReadOptions(parse_units(units), parse_position(laser), line_spacing), speed)
+                recording = spec.read()
+                for note in recording.notes:
+                    errors.print(f"note: {note}", highlight=False, soft_wrap=True)
+                source, origin_mm = spec.open(recording), (0.0, 0.0, 0.0)
+                settings = SessionSettings(
+                    point_spacing_mm=0.0 if plain_radius else _known(recording.point_spacing_mm),
+                    density_per_mm2=density,
+                    noise_mm=noise,
+                )
+            book = SessionBook(opened)
+            stack.callback(book.close)
+            live = book.create(file.name, spec, settings, origin_mm, source)
+            _play(live, quiet=as_json)
+            summary = write_outputs(out, live)
+            results = live.results()
+        if as_json:
+            show_json(summary)
+        elif results is not None:
+            _tell(results.report.to_dict()["regions"], summary, out)
+
+
+def _play(session: LiveSession, quiet: bool) -> None:
+    """Run the session to its end."""
+    session.start()
+    with scan_progress("replaying", quiet) as progress:
+        while not session.wait_until_over(0.2):
+            progress.show(_facts(session))
+        progress.show(_facts(session))
+    if session.state == "failed":
+        raise ValueError(session.status().message or "the replay failed")
+
+
+def _facts(session: LiveSession) -> dict[str, Any]:
+    status = session.status()
+    return {name: getattr(status, name) for name in ("lines", "points_per_s", "coverage", "progress", "losses")}
+
+
+def _tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
+    console.print(regions_table(regions, "Rescan regions"))
+    share = summary["coverage"]["share"]
+    console.print(
+        f"{summary['points']:,} points in {summary['scanlines']:,} scanlines, line spacing "
+        f"{summary['line_spacing_mm']['median']:.3f} mm, radius {summary['radius_mm']['median']:.3f} mm, "
+        f"{summary['reliable_share']:.1%} with a reliable normal; observed coverage {share:.1%}",
+        highlight=False,
+    )
+    console.print(f"Written to {out}: {', '.join(OUTPUT_FILES)}", highlight=False, soft_wrap=True)
+
+
+def is_record(file: Path) -> bool:
+    """True for a database of this kind; what else it may be is told by the readers."""
+    try:
+        with file.open("rb") as opened:
+            return opened.read(16) == b"SQLite format 3\x00"
+    except OSError:
+        return False
+
+
+def _known(value_mm: float) -> float | None:
+    return None if math.isnan(value_mm) else value_mm

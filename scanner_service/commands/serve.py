@@ -1,0 +1,44 @@
+"""`scanner serve`: the service until it is told to stop."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scanner_service.api.app import make_app
+from scanner_service.api.login import login_url
+from scanner_service.api.origins import Allowlist
+from scanner_service.api.server import Listening, Tls, serve
+from scanner_service.api.service import Service
+from scanner_service.commands.terminal import errors, plain_errors
+
+DATA_HELP = "Folder of the record, the keys and the replay files."
+Data = Annotated[Path, typer.Option("--data", envvar="SCANNER_DATA", help=DATA_HELP)]
+DEFAULT_DATA = Path.home() / ".local" / "share" / "scanner-service"
+
+
+def serve_command(
+    data: Data = DEFAULT_DATA,
+    host: Annotated[str, typer.Option(help="Address to listen on; other than loopback only with TLS.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes a free one.")] = 8765,
+    certificate: Annotated[Path | None, typer.Option(help="TLS certificate chain (PEM).")] = None,
+    private_key: Annotated[Path | None, typer.Option(help="TLS private key (PEM).")] = None,
+    allow_host: Annotated[list[str] | None, typer.Option(help="A further name this service answers to.")] = None,
+    allow_origin: Annotated[list[str] | None, typer.Option(help="A further origin whose pages may use it.")] = None,
+) -> None:
+    """Run the service: REST, live stream and viewer."""
+    with plain_errors():
+        if (certificate is None) != (private_key is None):
+            raise ValueError("--certificate and --private-key belong together: give both or neither")
+        tls = Tls(certificate, private_key) if certificate is not None and private_key is not None else None
+        allowlist = Allowlist(frozenset(allow_host or ()), frozenset(allow_origin or ()))
+        service = Service.open(data)
+
+        def announce(listening: Listening) -> None:
+            errors.print(f"Viewer: {login_url(service.access, listening.url)}", soft_wrap=True, highlight=False)
+            errors.print(f"API:    {listening.url}/docs   (the viewer's address works once, for ten minutes)")
+
+        try:
+            serve(make_app(service, allowlist), host, port, tls=tls, on_bound=announce)
+        finally:
+            service.close()

@@ -1,0 +1,58 @@
+"""`scanner simulate`: a simulated laser-line scanner behind a pseudo-terminal."""
+
+import signal
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json
+
+
+def simulate_command(
+    part: Annotated[str, typer.Option(help="Part under the scanner: demo, plate, step or sphere.")] = "demo",
+    mesh: Annotated[Path | None, typer.Option(help="A mesh instead: .stl, .obj or .ply.")] = None,
+    scale: Annotated[float, typer.Option(help="Millimetres in one unit of the mesh.")] = 1.0,
+    baud: Annotated[int, typer.Option(min=1, help="Rate of the wire.")] = 3_000_000,
+    seed: Annotated[int, typer.Option(help="Of noise, dropouts and faults.")] = 1,
+    link: Annotated[Path | None, typer.Option(help="A symbolic link that always names the terminal.")] = None,
+    flip_rate: Annotated[float, typer.Option(help="Chance that a bit is flipped on the wire.")] = 0.0,
+    loss_rate: Annotated[float, typer.Option(help="Chance that a byte is lost on the wire.")] = 0.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the port as a line of JSON.")] = False,
+) -> None:
+    """Simulate a scanner and print the port to open; runs until Ctrl-C."""
+    try:
+        from simulators.faults import Faults  # noqa: PLC0415 - an extra: tell how to get it
+        from simulators.meshes import MeshError  # noqa: PLC0415
+        from simulators.parts import PARTS, mesh_part  # noqa: PLC0415
+        from simulators.process import serve_simulated_scanner  # noqa: PLC0415
+        from simulators.pty_port import SimulatedPortError  # noqa: PLC0415
+    except ImportError as error:
+        fail(f"the simulator needs {error.name}: install scanner-service[simulation]")
+    if mesh is None and part not in PARTS:
+        fail(f"there is no part {part}; the parts are {', '.join(sorted(PARTS))}")
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+
+    def announce(event: dict[str, object]) -> None:
+        if as_json:
+            show_json(event)
+            return
+        console.print(f"port: {event['port']}", highlight=False, soft_wrap=True)
+        errors.print(f"{event['part']}, {event['baud_rate']} baud. Ctrl-C ends it.")
+
+    with plain_errors():
+        try:
+            serve_simulated_scanner(
+                mesh_part(mesh, scale) if mesh is not None else PARTS[part](),
+                stop=stop,
+                announce=announce,
+                baud_rate=baud,
+                seed=seed,
+                link_path=link,
+                faults=Faults(bit_error_rate=flip_rate, byte_loss_rate=loss_rate),
+            )
+        except (SimulatedPortError, MeshError) as error:
+            fail(str(error))

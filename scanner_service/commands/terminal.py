@@ -1,0 +1,133 @@
+"""How commands speak to a person or a program: progress, tables, JSON, one plain sentence for an error."""
+
+import contextlib
+import json
+import math
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any, NoReturn
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from drivers.errors import DriverError
+from scanner_service.api.answers import plain
+from scanner_service.api.keys import KeyStoreError
+from scanner_service.api.server import ServerError
+from scanner_service.sessions.errors import SessionError
+from scanner_service.storage.errors import RecordError
+from scanner_service.storage.exports.errors import ExportError
+from scanner_service.storage.formats.errors import FormatError
+
+console = Console()
+errors = Console(stderr=True)
+EXPECTED = (
+    DriverError,
+    KeyStoreError,
+    ServerError,
+    SessionError,
+    RecordError,
+    ExportError,
+    FormatError,
+    OSError,
+    ValueError,
+)
+
+
+def fail(sentence: str) -> NoReturn:
+    """End with one plain sentence and status 1."""
+    errors.print(sentence, style="bold red", highlight=False, soft_wrap=True)
+    raise typer.Exit(1)
+
+
+@contextlib.contextmanager
+def plain_errors() -> Iterator[None]:
+    """Tell what users can mend in one sentence; let faults of the program show themselves."""
+    try:
+        yield
+    except EXPECTED as error:
+        fail(str(error) or type(error).__name__)
+    except KeyboardInterrupt:
+        errors.print("Stopped.")
+        raise typer.Exit(130) from None
+
+
+def show_json(value: Any) -> None:
+    """Print a result for programs: NaN is null."""
+    sys.stdout.write(json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
+
+
+@contextlib.contextmanager
+def scan_progress(title: str, quiet: bool = False) -> "Iterator[ScanProgress]":
+    """A progress bar with lines, points/s, coverage and losses; on standard error, so that results stay clean."""
+    bar = Progress(
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TextColumn("{task.fields[facts]}"),
+        TimeElapsedColumn(),
+        console=errors,
+        disable=quiet,
+        refresh_per_second=5,
+    )
+    with bar:
+        yield ScanProgress(bar, title, quiet)
+
+
+class ScanProgress:
+    """The bar of one scan; on something that is no terminal a line is printed now and then instead."""
+
+    def __init__(self, bar: Progress, title: str, quiet: bool) -> None:
+        self._bar = bar
+        self._task = bar.add_task(title, total=1.0, facts="")
+        self._is_terminal = errors.is_terminal
+        self._quiet = quiet
+        self._printed = -1.0
+
+    def show(self, status: Mapping[str, Any]) -> None:
+        """Show a status as the API gives it."""
+        coverage = status["coverage"]
+        share = "–" if coverage is None or math.isnan(coverage) else f"{coverage:.1%}"
+        facts = (
+            f"{status['lines']:,} lines  {status['points_per_s']:,.0f} points/s  coverage {share}  "
+            f"{lost_lines(status['losses']):,} lines lost"
+        )
+        done = status["progress"] or 0.0
+        self._bar.update(self._task, completed=done, facts=facts)
+        if not self._is_terminal and not self._quiet and done >= self._printed + 0.2:
+            self._printed = done
+            errors.print(f"{done:4.0%}  {facts}", highlight=False)
+
+
+def lost_lines(losses: Mapping[str, Any]) -> int:
+    """Lines that were sent and are not stored: on the wire, by the device, or refused here."""
+    device = losses.get("device") or {}
+    on_the_wire = sum(device.get("lines", {}).get("lost", {}).values()) if isinstance(device.get("lines"), dict) else 0
+    return int(on_the_wire) + int(sum(losses["lines"]["refused"].values()))
+
+
+def regions_table(regions: list[dict[str, Any]], title: str) -> Table:
+    """The rescan regions as people read them."""
+    table = Table(title=title, title_justify="left")
+    for name, justify in (("#", "right"), ("reason", "left"), ("area mm²", "right"), ("measured /mm²", "right")):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for name in ("required /mm²", "priority"):
+        table.add_column(name, justify="right")
+    table.add_column("remedy")
+    for region in regions:
+        table.add_row(
+            str(region["number"]),
+            str(region["reason"]).replace("_", " "),
+            f"{region['area_mm2']:.1f}",
+            _number(region["measured_per_mm2"]),
+            _number(region["required_per_mm2"]),
+            f"{region['priority']:.2f}",
+            str(region["remedy"]),
+        )
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None or math.isnan(value) else f"{value:.1f}"
