@@ -15,6 +15,7 @@ import { exportAddress, listSessions, startSession, stopSession } from "./servic
 import { SessionPicker } from "./session_picker.js";
 import { OVER, SessionView } from "./session_view.js";
 
+const TROUBLE_MS = 15000;
 const SURVEY_MS = 1000;
 const CLICK_SLACK_PX = 4;
 const EXPORTS = { "points.ply": "points with normals, density and flags", "density.png": "density map as a picture", "regions.json": "rescan regions", "summary.json": "summary of the session" };
@@ -24,6 +25,7 @@ let chosenRegion = null;
 let inspectedRow = -1;
 let connectionState = "none";
 let frames = 0;
+let troubled = { text: "", until: 0 };
 
 const session = new SessionView({ points, status, regions, connection, trouble });
 const view = openView();
@@ -63,7 +65,7 @@ function status() {
   const progress = byId("progress");
   progress.hidden = told.progress === null || told.progress === undefined;
   if (!progress.hidden) progress.value = told.progress;
-  say(told.message ?? "");
+  say();
   drawFigures(byId("figures"), told, session.store, session.box);
   drawLosses(byId("losses"), byId("losses-count"), told.losses);
 }
@@ -93,13 +95,15 @@ function connection({ state, seconds, attempt, reason }) {
   byId("connection").title = reason || "";
   byId("retry").hidden = state !== "waiting";
   byId("view").classList.toggle("stale", state === "waiting" || state === "connecting" || state === "quiet");
-  if (state === "open") say(session.status?.message ?? "");
+  if (state === "open") trouble("");
   if (state === "absent") notice(reason || "There is no such session.");
-  if (state === "waiting") listSessions().catch((refusal) => say(refusal.message)); // it may say why
+  if (state === "waiting") listSessions().catch((refusal) => trouble(refusal.message)); // it may say why
 }
 
+// Stays in sight before what the status says, for a while or until the connection is mended.
 function trouble(text) {
-  say(text);
+  troubled = { text, until: performance.now() + TROUBLE_MS };
+  say();
 }
 
 // --- the picture ----------------------------------------------------------------------------------------------------
@@ -157,7 +161,7 @@ function openSession(chosen) {
   history.replaceState(null, "", `?session=${encodeURIComponent(chosen.id)}`);
   chosenRegion = null;
   inspect(-1);
-  say("");
+  trouble("");
   view.touched = false;
   look.range = look.autoRange ? [0, 1] : look.range;
   notice("Waiting for the first points…");
@@ -206,7 +210,8 @@ function rowUnder(event) {
   return pickPoint(session.store, view.clipFromPart(), view.width, view.height, event.clientX - frame.left, event.clientY - frame.top);
 }
 
-function say(text) {
+function say() {
+  const text = (performance.now() < troubled.until && troubled.text) || session.status?.message || "";
   byId("message").hidden = !text;
   if (byId("message").textContent !== text) byId("message").textContent = text;
 }
@@ -219,8 +224,9 @@ async function command(button, act) {
   button.disabled = true;
   try {
     await act(session.id);
+    trouble("");
   } catch (refusal) {
-    say(refusal.message);
+    trouble(refusal.message);
   }
   button.disabled = false;
 }
