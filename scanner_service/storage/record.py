@@ -109,7 +109,7 @@ class Record:
                 undo.callback(lock.release)
                 if not path.exists():
                     create_file(path, _iso(clock()))
-            check_file(path)
+                check_file(path)
             try:
                 writer = Writer(path, writer_engine(path, connection_class), limits or Limits())
             except DBAPIError as error:

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from scanner_service.storage.database import SqliteLibrary
+from scanner_service.storage.database import PAGE_BYTES, SqliteLibrary
 from scanner_service.storage.errors import NotARecord, RecordInUse, RecordNotWritable, RecordTooNew
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
+from scanner_service.storage.rows import Limits
 from scanner_service.storage.tables import SCHEMA_VERSION
 from tests.unit.storage.record_lines import bits, line_of
 
@@ -90,6 +91,23 @@ def test_a_creation_that_was_interrupted_is_begun_anew(tmp_path: Path) -> None:
     with Record.open(tmp_path / "r") as record:
         assert record.list_sessions() == []
     assert not (tmp_path / "r.new").exists()
+
+
+def test_a_service_killed_in_the_middle_of_copying_its_log_finds_its_record_again(tmp_path: Path) -> None:
+    path, killed = tmp_path / "r", tmp_path / "killed"
+    with Record.open(path, limits=Limits(checkpoint_bytes=1 << 40)) as record:
+        session = record.create_session("copied").session_id
+        truth = [bits(line_of(index)) for index in range(50)]
+        for future in [record.append(session, line_of(index)) for index in range(50)]:
+            future.result()
+        before = path.read_bytes()
+        killed.with_name("killed-wal").write_bytes((tmp_path / "r-wal").read_bytes())
+    after = path.read_bytes()
+    assert len(after) > len(before)
+    killed.write_bytes(after[:PAGE_BYTES] + before[PAGE_BYTES:])  # the first page alone was copied
+    with Record.open(killed) as record:
+        assert [bits(line) for _, line in record.lines(session)] == truth
+        assert record.verify(session).problems == ()
 
 
 def test_the_writer_syncs_every_commit_and_nobody_maps_the_file(tmp_path: Path) -> None:
