@@ -27,7 +27,7 @@ class Coverage:
     border-aware density, `required_per_mm2` the mean requirement, `reason` the verdict that most of its
     surface has, `meets` whether most of its surface meets the requirement (the ends of a shadow do: what lacks is the
     gap beside them), `points` how many. `gap_mm2` is the area of the bounded gaps
-    (shadows) that were found. `share` = area that meets / (all area + gaps), NaN when nothing is judged.
+    (shadows) that were found. `share` = area that meets / (all area + gaps), NaN when nothing with an area is judged.
     """
 
     cell_mm: float
@@ -113,11 +113,12 @@ def observed_coverage(snapshot: MapSnapshot, report: RegionReport, cell_mm: floa
     passes = int(strips.group.max()) + 1
     by_pass = np.bincount(cell * passes + strips.group[rows], weights=stands_for, minlength=cells * passes)
     by_pass = by_pass.reshape(cells, passes)
-    area = (by_pass**2).sum(axis=1) / by_pass.sum(axis=1)
+    area = (by_pass**2).sum(axis=1) / np.maximum(by_pass.sum(axis=1), 1e-300)
     verdicts = len(Reason)
     votes = np.bincount(cell * verdicts + report.reason[rows], weights=stands_for, minlength=cells * verdicts)
     votes = votes.reshape(cells, verdicts)
     meets = votes[:, [Reason.NONE, Reason.SHADOW]].sum(axis=1) >= 0.5 * votes.sum(axis=1)
+    whole = float(area.sum()) + gap_mm2
     return Coverage(
         cell_mm=side,
         centre_mm=np.column_stack([mean(snapshot.points_mm[rows, k]) for k in range(3)]),
@@ -128,7 +129,7 @@ def observed_coverage(snapshot: MapSnapshot, report: RegionReport, cell_mm: floa
         meets=meets,
         points=count.astype(np.int32),
         gap_mm2=gap_mm2,
-        share=float(area[meets].sum()) / (float(area.sum()) + gap_mm2),
+        share=float(area[meets].sum()) / whole if whole > 0 else np.nan,
     )
 
 

@@ -107,7 +107,7 @@ def fan_of(
     e = strips.along[group] if len(group) else np.zeros((0, 3))
     c = axis[group] if len(group) else np.zeros((0, 3))
     e = e - c * np.einsum("ij,ij->i", e, c)[:, None]
-    e /= np.linalg.norm(e, axis=1, keepdims=True)
+    e /= np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-12)  # a line along the ray has no angle but 0
     depth = np.einsum("ij,ij->i", ray, c)
     return Fan(np.arctan2(np.einsum("ij,ij->i", ray, e), depth), depth, axis)
 

@@ -126,7 +126,7 @@ def judge(
     fast = ~lost & (gap > _SPARSE_GAP * delta)
     too_wide = width > _SLACK * allowed[:, None]
     # beyond this a neighbourhood no longer reaches the next line: Δs'/Δs > sqrt(2) + c/Δs
-    beyond = (width / stride > strips.reach_mm[:, None] / delta) & ~(lost | fast)
+    beyond = (width * delta > strips.reach_mm[:, None] * stride) & (stride > 0) & ~(lost | fast)
     one_sided = ~(snapshot.offset < LEAST_OFFSET)
     enough = (snapshot.density_per_mm2 >= required) & ~one_sided
     failing = ((too_wide & ~enough[:, None]) | beyond) & judged[:, None]

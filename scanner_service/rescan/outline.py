@@ -14,6 +14,7 @@ from scipy.spatial import Delaunay, QhullError
 from drivers.scanline import Float64Array
 from scanner_service.rescan.stations import IntArray
 
+_MANY = 20_000  # points beyond which a patch is thinned to one a cube of the connection length
 _FLAT = 1e-6  # extents below this share of the longest are no extent: the points are collinear
 
 
@@ -39,6 +40,15 @@ def patch_of(points_mm: Float64Array, connection_mm: Float64Array, spacing_mm: F
     spacing_mm : (n,) point spacing, for strands that have no triangle.
     """
     centroid = points_mm.mean(axis=0)
+    if len(points_mm) > _MANY:
+        cube_mm = float(np.median(connection_mm))
+        x, y, z = np.floor((points_mm - points_mm.min(axis=0)) / cube_mm).astype(np.int64).T
+        order = np.lexsort((z, y, x))
+        fresh = np.ones(len(order), dtype=bool)
+        fresh[1:] = (np.diff(x[order]) != 0) | (np.diff(y[order]) != 0) | (np.diff(z[order]) != 0)
+        one_each = np.sort(order[fresh])
+        points_mm, spacing_mm = points_mm[one_each], spacing_mm[one_each]
+        connection_mm = connection_mm[one_each] + cube_mm
     _, extent, axes = np.linalg.svd(points_mm - centroid, full_matrices=False)
     half = 0.5 * float(np.median(spacing_mm))
     normal = np.full(3, np.nan)

@@ -88,8 +88,8 @@ def strips_of(snapshot: MapSnapshot, stations: Stations, requirement: Requiremen
 
 
 def _point_spacing_of_lines(snapshot: MapSnapshot, stations: Stations) -> Float64Array:
-    """(L,) the line's point spacing, or the median of its pass where the line itself has none; else NaN."""
-    spacing = snapshot.lines.point_spacing_mm.copy()
+    """(L,) the line's point spacing, or the median of its pass where the line itself has none (or 0); else NaN."""
+    spacing = np.where(snapshot.lines.point_spacing_mm > 0, snapshot.lines.point_spacing_mm, np.nan)
     for number in np.unique(stations.group[np.isnan(spacing)]):
         rows = stations.group == number
         known = spacing[rows & np.isfinite(spacing)]

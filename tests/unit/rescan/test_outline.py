@@ -49,3 +49,11 @@ def test_points_in_a_row_have_an_area_and_a_closed_outline(count: int) -> None:
 def test_points_that_coincide_do_no_harm() -> None:
     points = np.ones((5, 3))
     assert patch_of(points, np.full(5, 1.0), np.full(5, 0.3)).area_mm2 > 0
+
+
+def test_a_patch_of_very_many_points_keeps_its_area_to_three_percent() -> None:
+    points = _grid(160, 0.1)
+    patch = patch_of(points, np.full(len(points), 0.25), np.full(len(points), 0.1))
+    assert len(points) > 20_000
+    assert len(patch.loops) == 1
+    assert patch.area_mm2 == pytest.approx(15.9**2, rel=0.03)
