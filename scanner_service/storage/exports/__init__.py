@@ -1,0 +1,20 @@
+"""Files that go out: points, picture and results, each whole under its name or not there at all."""
+
+from scanner_service.storage.exports.density_png import OutlinedRegion, density_png
+from scanner_service.storage.exports.errors import ExportError, ExportNotConfirmed, ExportNotWritten
+from scanner_service.storage.exports.points_ply import write_points_ply
+from scanner_service.storage.exports.results_json import json_bytes, write_json
+from scanner_service.storage.exports.whole_file import whole_file, write_whole
+
+__all__ = [
+    "ExportError",
+    "ExportNotConfirmed",
+    "ExportNotWritten",
+    "OutlinedRegion",
+    "density_png",
+    "json_bytes",
+    "whole_file",
+    "write_json",
+    "write_points_ply",
+    "write_whole",
+]

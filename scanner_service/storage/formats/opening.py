@@ -1,0 +1,127 @@
+"""Open a file as scanlines or as a plain cloud, told by its content and not by its name alone."""
+
+from pathlib import Path
+from typing import Literal
+
+from scanner_service.storage.formats.csv_profiles import read_csv_cloud, read_csv_recording
+from scanner_service.storage.formats.csv_table import is_profile_header
+from scanner_service.storage.formats.errors import (
+    FileEmpty,
+    FileNotReadable,
+    FileTooLarge,
+    FormatUnknown,
+    NoScanlines,
+)
+from scanner_service.storage.formats.ply import cloud_of, read_vertices
+from scanner_service.storage.formats.ply_header import is_ply
+from scanner_service.storage.formats.range_grid import recording_of_grid
+from scanner_service.storage.formats.recording import Cloud, ReadOptions, Recording
+from scanner_service.storage.formats.xyz import names_of_line, read_xyz
+
+Kind = Literal["ply", "csv profiles", "xyz", "record"]
+_HEAD_BYTES = 1 << 16
+
+
+def open_recording(path: Path, options: ReadOptions | None = None) -> Recording:
+    """Read the scanlines of a file: PLY with a range grid, or a profile table (CSV).
+
+    Raises
+    ------
+    FormatError : in one of its kinds; the message is one sentence that says what is wrong and what to do.
+    """
+    options = options or ReadOptions()
+    data = _content(path, options)
+    kind = kind_of_content(data[:_HEAD_BYTES], path.name)
+    if kind == "ply":
+        vertices = read_vertices(data, path.name, options.units)
+        if vertices.grid is None:
+            raise NoScanlines(f"{path.name} is a plain cloud without scanlines (no range_grid); analyse it as a cloud")
+        return recording_of_grid(vertices, path.name, options)
+    if kind == "csv profiles":
+        return read_csv_recording(_text(data, path.name), path.name, options)
+    if kind == "xyz":
+        raise NoScanlines(f"{path.name} is a plain cloud without scanlines; analyse it as a cloud")
+    raise _is_a_record(path.name)
+
+
+def open_cloud(path: Path, options: ReadOptions | None = None) -> Cloud:
+    """Read the points of a file without their scanlines: PLY, XYZ text, or a profile table (CSV).
+
+    Raises
+    ------
+    FormatError : in one of its kinds; the message is one sentence that says what is wrong and what to do.
+    """
+    options = options or ReadOptions()
+    data = _content(path, options)
+    kind = kind_of_content(data[:_HEAD_BYTES], path.name)
+    if kind == "ply":
+        return cloud_of(read_vertices(data, path.name, options.units), path.name)
+    if kind == "csv profiles":
+        return read_csv_cloud(_text(data, path.name), path.name, options)
+    if kind == "xyz":
+        return read_xyz(data, path.name, options.units)
+    raise _is_a_record(path.name)
+
+
+def kind_of_content(head: bytes, name: str) -> Kind:
+    """Tell the format from the first bytes of a file.
+
+    Raises
+    ------
+    FileEmpty : there is nothing.
+    FormatUnknown : it is of no kind that is read here.
+    """
+    if head.startswith(b"SQLite format 3\x00"):
+        return "record"
+    if is_ply(head):
+        return "ply"
+    if not head.strip():
+        raise FileEmpty(f"{name} is empty: there is nothing to read")
+    unknown = FormatUnknown(
+        f"{name} is none of the kinds that are read: PLY, profile table (CSV with columns line, x_mm, y_mm, z_mm), "
+        "text cloud (x y z)"
+    )
+    if b"\x00" in head:
+        raise unknown
+    for line in head.removeprefix(b"\xef\xbb\xbf").decode("latin-1").splitlines():
+        plain = line.strip()
+        if is_profile_header(plain):
+            return "csv profiles"
+        if names_of_line(plain) is not None:
+            return "xyz"
+        if not plain or plain.startswith(("#", "//", ";")):
+            continue
+        first = plain.replace(",", " ").replace(";", " ").split()
+        try:
+            float(first[0] if first else "none")
+        except ValueError:
+            raise unknown from None
+        return "xyz"
+    return "xyz"
+
+
+def _is_a_record(name: str) -> FormatUnknown:
+    return FormatUnknown(f"{name} is a record of this service; open it as a record and choose a session")
+
+
+def _content(path: Path, options: ReadOptions) -> bytes:
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise FileNotReadable(f"{path} is not a file; give the path of a scan")
+        if size > options.max_bytes:
+            raise FileTooLarge(f"{path.name} has {size} bytes; at most {options.max_bytes} are read")
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise FileNotReadable(f"{path} does not exist; check the path") from None
+    except PermissionError:
+        raise FileNotReadable(f"{path} may not be read by this user") from None
+    except (OSError, ValueError) as error:  # ValueError: a path with a NUL
+        raise FileNotReadable(f"{path} cannot be read: {error}") from None
+
+
+def _text(data: bytes, name: str) -> str:
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FormatUnknown(f"{name} is not UTF-8 text (byte {error.start}); save it as UTF-8") from None
