@@ -53,7 +53,9 @@ def analyse_command(
         write_points_ply(out / "points.ply", results.snapshot, results.verdict.rescan, version=__version__)
         write_whole(
             out / "density.png",
-            density_png(results.snapshot, results.report.regions, name=file.name, coverage=results.coverage.share),
+            density_png(
+                results.snapshot, results.report.regions, session_name=file.name, coverage=results.coverage.share
+            ),
         )
         write_json(out / "regions.json", results.report.to_dict())
         write_json(out / "summary.json", summary)

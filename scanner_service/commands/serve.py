@@ -1,5 +1,6 @@
 """`scanner serve`: the service until it is told to stop."""
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +26,7 @@ def serve_command(
     private_key: Annotated[Path | None, typer.Option(help="TLS private key (PEM).")] = None,
     allow_host: Annotated[list[str] | None, typer.Option(help="A further name this service answers to.")] = None,
     allow_origin: Annotated[list[str] | None, typer.Option(help="A further origin whose pages may use it.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Say where it listens as one line of JSON.")] = False,
 ) -> None:
     """Run the service: REST, live stream and viewer."""
     with plain_errors():
@@ -35,6 +37,11 @@ def serve_command(
         service = Service.open(data)
 
         def announce(listening: Listening) -> None:
+            if as_json:
+                print(
+                    json.dumps({"url": listening.url, "viewer": login_url(service.access, listening.url)}), flush=True
+                )
+                return
             errors.print(f"Viewer: {login_url(service.access, listening.url)}", soft_wrap=True, highlight=False)
             errors.print(f"API:    {listening.url}/docs   (the viewer's address works once, for ten minutes)")
 

@@ -27,7 +27,11 @@ def _points(path: Path, session: LiveSession, results: Results) -> None:
 
 def _density(path: Path, session: LiveSession, results: Results) -> None:
     picture = density_png(
-        results.snapshot, results.report.regions, name=session.row.name, coverage=results.coverage.share
+        results.snapshot,
+        results.report.regions,
+        session_name=session.row.name,
+        when=session.row.created_utc[:16].replace("T", " ") + " UTC",
+        coverage=results.coverage.share,
     )
     write_whole(path, picture)
 

@@ -36,9 +36,14 @@ class Results:
         return Verdict(self.report.rescan, self.report.reason)
 
 
-def judge(snapshot: MapSnapshot, requirement: Requirement, geometry: SensorGeometry | None) -> Results:
-    """Find the rescan regions and the coverage of a snapshot."""
-    report = find_regions(snapshot, requirement, geometry)
+def judge(
+    snapshot: MapSnapshot,
+    requirement: Requirement,
+    geometry: SensorGeometry | None = None,
+    towards_sensor: Float64Array | None = None,
+) -> Results:
+    """Find the rescan regions and the coverage of a snapshot; the last two as `find_regions` has them."""
+    report = find_regions(snapshot, requirement, geometry, towards_sensor=towards_sensor)
     return Results(snapshot, report, observed_coverage(snapshot, report))
 
 

@@ -265,7 +265,7 @@ class LiveSession:
             snapshot = self.engine.ask(lambda engine: engine.live_map.snapshot()).result()
             if unless is not None and snapshot.version == unless:
                 return self._results
-            results = judge(snapshot, self.settings.requirement(), self.source.geometry)
+            results = judge(snapshot, self.settings.requirement(), self.source.geometry, self.source.towards_sensor)
             self.engine.ask(lambda engine: self.verdicts.replace(results.verdict, engine.live_map)).result()
         except SessionError:
             return None

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+
 from drivers.errors import DriverError
 from drivers.protocols.scanner_events import (
     Disconnected,
@@ -21,7 +23,7 @@ from drivers.protocols.scanner_events import (
     Reconnected,
 )
 from drivers.rig import Rig
-from drivers.scanline import DeviceInfo, Profile, Scanline, SensorGeometry
+from drivers.scanline import DeviceInfo, Float64Array, Profile, Scanline, SensorGeometry
 from drivers.scanners.native import Happening, NativeScanner
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.sessions.errors import SourceUnusable
@@ -42,9 +44,14 @@ class Sink(Protocol):
 
 
 class Source(Protocol):
-    """A place where scanlines come from."""
+    """A place where scanlines come from.
+
+    `geometry` is the scanner's optics and `towards_sensor` (3,) the direction of its z axis in the part frame; None
+    when they are not known.
+    """
 
     geometry: SensorGeometry | None
+    towards_sensor: Float64Array | None
 
     def start(self, sink: Sink) -> None:
         """Begin to deliver; raises SourceUnusable or a DriverError when that cannot be done."""
@@ -74,6 +81,7 @@ class DeviceSource:
 
     def __init__(self, scanner: NativeScanner, rig: Rig, request: PassRequest, info: DeviceInfo) -> None:
         self.geometry: SensorGeometry | None = info.geometry
+        self.towards_sensor: Float64Array | None = rig.part_from_sensor(0.0).rotate(np.array([0.0, 0.0, 1.0]))
         self.info = info
         self._scanner = scanner
         self._rig = rig
@@ -166,6 +174,7 @@ class ReplaySource:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.geometry: SensorGeometry | None = None
+        self.towards_sensor: Float64Array | None = None
         self._lines = lines
         self._line_count = line_count
         self._accounts = accounts
@@ -217,6 +226,7 @@ class SpentSource:
     """The source of a session that was reopened from the record: what it had is stored, nothing more comes."""
 
     geometry: SensorGeometry | None = None
+    towards_sensor: Float64Array | None = None
 
     def start(self, sink: Sink) -> None:
         """Cannot be started again."""
@@ -238,6 +248,7 @@ class PushSource:
     """Lines that a client pushes through the session itself: nothing to run, nothing that ends by itself."""
 
     geometry: SensorGeometry | None = None
+    towards_sensor: Float64Array | None = None
 
     def start(self, sink: Sink) -> None:
         """Nothing to begin."""

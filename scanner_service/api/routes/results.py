@@ -83,7 +83,7 @@ def density_map_picture(
     picture = density_png(
         results.snapshot,
         results.report.regions,
-        name=session.row.name,
+        session_name=session.row.name,
         coverage=results.coverage.share,
         direction=direction,
     )

@@ -1,0 +1,98 @@
+"""Real processes for end-to-end tests: the service, and a simulated scanner behind a pseudo-terminal."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE_S = 60.0
+
+
+class RunningService:
+    """`scanner serve` in a process of its own, and a client with its local key."""
+
+    def __init__(self, data: Path):
+        self.data = data
+        command = [sys.executable, "-m", "scanner_service", "serve", "--data", str(data), "--port", "0", "--json"]
+        self.log = (data.parent / f"{data.name}.log").open("ab")
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=self.log, text=True, cwd=ROOT)
+        announced = self.process.stdout.readline()
+        if not announced:
+            self.end()
+            raise RuntimeError(Path(self.log.name).read_text())
+        where = json.loads(announced)
+        self.url, self.viewer = where["url"], where["viewer"]
+        self.key = (data / "local-key").read_text().strip()
+        self.client = httpx.Client(base_url=self.url, headers={"Authorization": f"Bearer {self.key}"}, timeout=60.0)
+        wait_for(lambda: self.client.get("/readyz").status_code == 200, "the service to be ready")
+
+    def kill(self):
+        """Pull the plug: no time to write or to say anything."""
+        self.process.send_signal(signal.SIGKILL)
+        self.end()
+
+    def end(self):
+        with contextlib.suppress(ProcessLookupError):
+            self.process.terminate()
+        self.process.wait(30)
+        self.process.stdout.close()
+        self.log.close()
+        if hasattr(self, "client"):
+            self.client.close()
+
+    def create(self, **source):
+        answer = self.client.post("/api/v1/sessions", json={"name": "test", "source": source})
+        assert answer.status_code == 201, answer.text
+        return answer.json()["id"]
+
+    def start(self, session_id):
+        answer = self.client.post(f"/api/v1/sessions/{session_id}/start")
+        assert answer.status_code == 200, answer.text
+
+    def status(self, session_id):
+        answer = self.client.get(f"/api/v1/sessions/{session_id}")
+        assert answer.status_code == 200, answer.text
+        return answer.json()
+
+    def wait_for_state(self, session_id, state):
+        wait_for(lambda: self.status(session_id)["state"] == state, f"session {session_id} to be {state}")
+        return self.status(session_id)
+
+
+class RunningSimulator:
+    """`python -m simulators` in a process of its own; commands go in, announcements come out."""
+
+    def __init__(self, part="plate", *arguments):
+        command = [sys.executable, "-m", "simulators", "--part", part, *map(str, arguments)]
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=os.environ
+        )
+        self.ready = json.loads(self.process.stdout.readline())
+        self.port = self.ready["port"]
+
+    def tell(self, command):
+        self.process.stdin.write(command + "\n")
+        self.process.stdin.flush()
+        return json.loads(self.process.stdout.readline())
+
+    def end(self):
+        self.process.terminate()
+        self.process.wait(10)
+        self.process.stdin.close()
+        self.process.stdout.close()
+
+
+def wait_for(condition, what):
+    """Poll until the condition holds; fails with a sentence when it never does."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        if time.monotonic() > deadline_s:
+            raise AssertionError(f"waited {PATIENCE_S:g} s for {what}")
+        time.sleep(0.05)
