@@ -24,6 +24,7 @@ from scanner_service.storage.formats.laser_position import laser_of_lines, shown
 from scanner_service.storage.formats.parallel_lines import ParallelLines, fit_parallel_lines
 from scanner_service.storage.formats.recording import Cloud, ReadOptions, Recording, finite_rows
 from scanner_service.storage.formats.spacing import median_point_spacing_mm
+from scanner_service.storage.formats.text_numbers import CUT_NOTE
 
 Int64Array = npt.NDArray[np.int64]
 _PLACES_PER_ROW = 64  # an index column may leave this many empty places a row, on the average
@@ -68,6 +69,7 @@ def read_csv_recording(text: str, name: str, options: ReadOptions) -> Recording:
     laser, laser_note = _lasers(table, groups, fits, options, name)
     spacing, spacing_note = _spacings(table, groups, fits, options, name)
     index, index_note = _line_indices(groups)
+    cut_note = "" if text.endswith(("\n", "\r")) else CUT_NOTE
     starts = np.cumsum(length) - length
     flat = np.full((int(length.sum()), 3), nan)
     flat[starts[groups.line[finite]] + place[finite]] = points[finite]
@@ -102,7 +104,7 @@ def read_csv_recording(text: str, name: str, options: ReadOptions) -> Recording:
         line_spacing_mm=float(np.median(spacing)),
         point_spacing_mm=median_point_spacing_mm(line.points_mm for line in lines),
         dropped=dropped,
-        notes=tuple(note for note in (laser_note, spacing_note, index_note) if note),
+        notes=tuple(note for note in (laser_note, spacing_note, index_note, cut_note) if note),
     )
 
 

@@ -19,6 +19,7 @@ Int64Array = npt.NDArray[np.int64]
 
 _STRAIGHT = 1e-4  # variance across a line over variance along it, below which its plane is not seen
 _SNAP_RAD = np.radians(0.5)  # a normal this close to an axis of the part is that axis: stages are built so
+_FAR_MM = 1e6  # a point this far from the others is damage, and would decide the fit alone
 _THICK = 0.5  # a line thicker than this share of the spacing is no plane
 
 
@@ -45,6 +46,10 @@ def fit_parallel_lines(
     between its halves. Returns None when there are fewer than two lines with points, when the lines lie in no common
     direction (hand-guided), or when they do not advance.
     """
+    if not len(points_mm):
+        return None
+    near = np.asarray((np.abs(points_mm - np.median(points_mm, axis=0)) < _FAR_MM).all(axis=1))
+    points_mm, line, odd = points_mm[near], line[near], None if odd is None else odd[near]
     count = np.bincount(line, minlength=len(line_number))
     present = count > 0
     if present.sum() < 2:

@@ -11,6 +11,7 @@ from scanner_service.storage.formats.errors import ContentDamaged, FileEmpty, He
 from scanner_service.storage.formats.ply_body import Ragged, read_rows
 from scanner_service.storage.formats.ply_header import PlyHeader, check_size, parse_header
 from scanner_service.storage.formats.recording import MM_PER_UNIT, Cloud, Units, finite_rows
+from scanner_service.storage.formats.text_numbers import CUT_NOTE
 
 Int64Array = npt.NDArray[np.int64]
 _UNIT_WORDS = {
@@ -59,6 +60,9 @@ def read_vertices(data: bytes, name: str, units: Units | None) -> PlyVertices:
     rows = read_rows(header, data, name)
     scalars = rows["vertex"].scalars
     unit, note = _decide_units(header, units)
+    notes: tuple[str, ...] = (note,)
+    if header.byte_order is None and not data.endswith((b"\n", b"\r", b" ")):
+        notes += (CUT_NOTE,)
     with np.errstate(over="ignore", invalid="ignore"):
         points_mm = np.stack([scalars[axis] for axis in "xyz"], axis=1) * MM_PER_UNIT[unit]
     normals = None
@@ -69,7 +73,7 @@ def read_vertices(data: bytes, name: str, units: Units | None) -> PlyVertices:
         raise HeaderDamaged(f"{name}: the range grid has no list vertex_indices, so its cells cannot be read")
     if grid is not None:
         _check_indices(grid, vertex.count, name)
-    return PlyVertices(header, points_mm, normals, grid, (note,))
+    return PlyVertices(header, points_mm, normals, grid, notes)
 
 
 def cloud_of(vertices: PlyVertices, name: str) -> Cloud:

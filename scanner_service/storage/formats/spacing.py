@@ -17,7 +17,8 @@ def median_point_spacing_mm(lines_mm: Iterable[Float64Array]) -> float:
     for points in lines_mm:
         present = points[np.isfinite(points).all(axis=1)]
         if len(present) > 1:
-            gaps.append(np.linalg.norm(np.diff(present, axis=0), axis=1))
+            with np.errstate(over="ignore"):  # damaged coordinates; the median does not feel them
+                gaps.append(np.linalg.norm(np.diff(present, axis=0), axis=1))
     return float(np.median(np.concatenate(gaps))) if gaps else float("nan")
 
 

@@ -12,6 +12,9 @@ _BLOCK_BYTES = 1 << 23
 Int64Array = npt.NDArray[np.int64]
 
 
+CUT_NOTE = "the last line has no line break: if the file was cut within its last number, nothing tells"
+
+
 @dataclass(frozen=True, slots=True)
 class TextNumbers:
     """Numbers of a text; blank lines are left out.

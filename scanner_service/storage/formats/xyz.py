@@ -10,7 +10,7 @@ import numpy as np
 
 from scanner_service.storage.formats.errors import ContentDamaged, FileEmpty, HeaderDamaged
 from scanner_service.storage.formats.recording import MM_PER_UNIT, Cloud, Units, finite_rows
-from scanner_service.storage.formats.text_numbers import numbers_of_text
+from scanner_service.storage.formats.text_numbers import CUT_NOTE, numbers_of_text
 
 _COMMENT = re.compile(rb"^[ \t]*(?:#|//|;)[^\n]*", re.MULTILINE)
 _NORMAL = ("nx", "ny", "nz")
@@ -66,6 +66,8 @@ def read_xyz(data: bytes, name: str, units: Units | None) -> Cloud:
     notes = [f"lengths are read as {unit}, {why}"]
     if names is None and width not in (3, 6):
         notes.append(f"only the first 3 of {width} unnamed columns are read, as x y z")
+    if not data.endswith((b"\n", b"\r")):
+        notes.append(CUT_NOTE)
     lost = int((~kept).sum())
     return Cloud(
         source=name,
