@@ -18,6 +18,7 @@ from scanner_service.storage.formats.errors import (
     FileEmpty,
     FileTooLarge,
     LaserUnknown,
+    OptionRefused,
     SpacingUnknown,
 )
 from scanner_service.storage.formats.laser_position import laser_of_lines, shown_laser
@@ -51,7 +52,9 @@ def read_csv_recording(text: str, name: str, options: ReadOptions) -> Recording:
     ContentDamaged : rows of one line disagree about it, or two claim one place; the message names the row.
     LaserUnknown, SpacingUnknown : neither in the table, nor given, nor derivable.
     FileEmpty : not one row has a finite point.
+    OptionRefused : units other than millimetres.
     """
+    _refuse_other_units(name, options)
     table = read_table(text, name, options.device_id or name.rsplit(".", 1)[0])
     points = _points(table)
     finite, dropped = _kept(points)
@@ -114,13 +117,20 @@ def read_csv_cloud(text: str, name: str, options: ReadOptions) -> Cloud:
     Raises
     ------
     FileEmpty : not one row has a finite point.
+    OptionRefused : units other than millimetres.
     """
+    _refuse_other_units(name, options)
     points = _points(read_table(text, name, options.device_id or "cloud"))
     finite, dropped = _kept(points)
     if not finite.any():
         raise FileEmpty(f"{name} holds no point with finite coordinates: there is nothing to analyse")
     notes = ("the table's scanlines are left aside: it is read as a plain cloud",)
     return Cloud(name, "csv profiles", points[finite], None, len(finite), dropped, notes)
+
+
+def _refuse_other_units(name: str, options: ReadOptions) -> None:
+    if options.units not in (None, "auto", "mm"):
+        raise OptionRefused(f"{name} names its columns x_mm, y_mm, z_mm: they are millimetres, not {options.units}")
 
 
 def _points(table: ProfileTable) -> Float64Array:

@@ -16,6 +16,7 @@ from scanner_service.storage.formats import (
     HeaderDamaged,
     LaserUnknown,
     NoScanlines,
+    OptionRefused,
     ReadOptions,
     SpacingUnknown,
     open_cloud,
@@ -139,6 +140,11 @@ def test_a_flat_plate_is_understood_from_the_way_its_lines_follow_each_other():
 def test_a_bad_table_is_refused_with_the_row(text, fact, words):
     with pytest.raises(fact, match=words):
         read(text, laser_mm=(0.0, 0.0, 100.0))
+
+
+def test_units_that_contradict_the_columns_are_refused():
+    with pytest.raises(OptionRefused, match="they are millimetres"):
+        read("\n".join([HEADER, *rows()]), units="m")
 
 
 def test_a_laser_that_nobody_names_is_asked_for():
