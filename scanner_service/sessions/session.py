@@ -114,10 +114,14 @@ class LiveSession:
                 raise SessionBusy("the session is scanning already")
             if self._state != "created" and not isinstance(self.source, PushSource):
                 raise SessionBusy(f"the session is {self._state}; create another one to scan again")
-            self.source.start(self)
-            self._begun_s = self._clock()
-            self._ended_s = None
-            self._set_state("scanning")
+            before, self._state = self._state, "scanning"  # a short source may end before its start returns
+            self._begun_s, self._ended_s = self._clock(), None
+            try:
+                self.source.start(self)
+            except BaseException:
+                self._state = before
+                raise
+            self._set_state(self._state)
 
     def push(self, line: Scanline) -> "Future[Stored]":
         """Hand over a scanline of a client; the future has the record's answer once the line is durable.
