@@ -13,10 +13,12 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from scanner_service.analysis.points import PointArray
 from scanner_service.analysis.snapshot import Int32Array, UInt8Array
 
 CHUNK = 8
 BLOCK_CELLS = 64
+QUEUED, SPREAD = 1, 2
 SMALLEST_SIDE_Q = 2048
 """Cells are never smaller than this, so that cell coordinates stay below 2^20."""
 
@@ -25,9 +27,12 @@ class Grid(NamedTuple):
     """The grid's arrays; `*_used` are one-element counters, index -1 means none.
 
     `hash_block` (2^k,) holds block + 1 or 0; `block_key` (B, 3) block coordinates; `block_near` (B, 27) neighbouring
-    blocks; `block_cell` (B, 64) the cell at each place. `cell_at` (C, 3) cell coordinates, `cell_block` (C,),
-    `cell_first`, `cell_last` (C,) chunks, `cell_count` (C,) points, `cell_stale` (C,) 1 while queued in `stale` (C,).
-    `chunk_next` (K,), `chunk_xyz` (K, 3, CHUNK) int32 coordinates and `chunk_point` (K, CHUNK) point rows.
+    blocks; `block_cell` (B, 64) the cell at each place; `block_needy` (B,) a bit for each cell with a point whose
+    radius had to grow, `block_round` (B,) the round in which those around were queued. `cell_at` (C, 3) cell
+    coordinates, `cell_block` (C,), `cell_first`, `cell_last` (C,) chunks, `cell_count` (C,) points, `cell_stale` (C,)
+    QUEUED in `stale` (C,), or SPREAD when its neighbours are queued too. `chunk_next` (K,), `chunk_xyz` (K, 3, CHUNK)
+    int32 coordinates, `chunk_line` (K, CHUNK) scanlines and `chunk_point` (K, CHUNK) point rows. `round` counts
+    evaluations.
     """
 
     side_q: npt.NDArray[np.int64]
@@ -36,6 +41,8 @@ class Grid(NamedTuple):
     block_key: Int32Array
     block_near: Int32Array
     block_cell: Int32Array
+    block_needy: npt.NDArray[np.uint64]
+    block_round: Int32Array
     cells_used: npt.NDArray[np.int64]
     cell_at: Int32Array
     cell_block: Int32Array
@@ -48,7 +55,9 @@ class Grid(NamedTuple):
     chunks_used: npt.NDArray[np.int64]
     chunk_next: Int32Array
     chunk_xyz: Int32Array
+    chunk_line: Int32Array
     chunk_point: Int32Array
+    round: Int32Array
 
 
 def reserve_grid(side_q: int, max_points: int) -> Grid:
@@ -67,6 +76,8 @@ def reserve_grid(side_q: int, max_points: int) -> Grid:
         block_key=np.empty((blocks, 3), dtype=np.int32),
         block_near=np.empty((blocks, 27), dtype=np.int32),
         block_cell=np.empty((blocks, BLOCK_CELLS), dtype=np.int32),
+        block_needy=np.zeros(blocks, dtype=np.uint64),
+        block_round=np.zeros(blocks, dtype=np.int32),
         cells_used=counter(),
         cell_at=np.empty((cells, 3), dtype=np.int32),
         cell_block=np.empty(cells, dtype=np.int32),
@@ -79,147 +90,194 @@ def reserve_grid(side_q: int, max_points: int) -> Grid:
         chunks_used=counter(),
         chunk_next=np.empty(cells, dtype=np.int32),
         chunk_xyz=np.empty((cells, 3, CHUNK), dtype=np.int32),
+        chunk_line=np.empty((cells, CHUNK), dtype=np.int32),
         chunk_point=np.empty((cells, CHUNK), dtype=np.int32),
+        round=np.ones(1, dtype=np.int32),
     )
 
 
+# The kernels take the arrays they need one by one: an array taken out of a tuple inside a loop costs two atomic
+# operations each time, which is more than the work itself.
+
+
 @njit(cache=True, nogil=True)
-def _slot(grid: Grid, bx: int, by: int, bz: int) -> int:
+def _slot(hash_block, block_key, bx, by, bz):
     """The place of a block in the hash table: its own, or the empty one where it belongs."""
-    mask = len(grid.hash_block) - 1
+    mask = len(hash_block) - 1
     h = np.uint64(bx) * np.uint64(0x9E3779B97F4A7C15)
     h ^= np.uint64(by) * np.uint64(0xC2B2AE3D27D4EB4F)
     h ^= np.uint64(bz) * np.uint64(0x165667B19E3779F9)
     h ^= h >> np.uint64(29)
     slot = np.int64(h & np.uint64(mask))
     while True:
-        block = grid.hash_block[slot] - 1
-        if block < 0:
-            return slot
-        key = grid.block_key[block]
-        if key[0] == bx and key[1] == by and key[2] == bz:
+        block = hash_block[slot] - 1
+        if block < 0 or (block_key[block, 0] == bx and block_key[block, 1] == by and block_key[block, 2] == bz):
             return slot
         slot = (slot + 1) & mask
 
 
 @njit(cache=True, nogil=True)
-def _block_at(grid: Grid, bx: int, by: int, bz: int) -> int:
+def _block_at(hash_block, blocks_used, block_key, block_near, block_cell, bx, by, bz):
     """The block at these block coordinates, made if it is not there; -1 when no block is left."""
-    slot = _slot(grid, bx, by, bz)
-    block = grid.hash_block[slot] - 1
+    slot = _slot(hash_block, block_key, bx, by, bz)
+    block = np.int64(hash_block[slot] - 1)
     if block >= 0:
         return block
-    block = grid.blocks_used[0]
-    if block >= len(grid.block_key):
-        return -1
-    grid.blocks_used[0] = block + 1
-    grid.hash_block[slot] = block + 1
-    grid.block_key[block, 0], grid.block_key[block, 1], grid.block_key[block, 2] = bx, by, bz
-    grid.block_cell[block, :] = -1
+    block = blocks_used[0]
+    if block >= len(block_key):
+        return np.int64(-1)
+    blocks_used[0] = block + 1
+    hash_block[slot] = block + 1
+    block_key[block, 0], block_key[block, 1], block_key[block, 2] = bx, by, bz
+    for place in range(BLOCK_CELLS):
+        block_cell[block, place] = -1
     for near in range(27):
-        dx, dy, dz = near // 9 - 1, (near // 3) % 3 - 1, near % 3 - 1
         if near == 13:
-            grid.block_near[block, near] = block
+            block_near[block, near] = block
             continue
-        other = grid.hash_block[_slot(grid, bx + dx, by + dy, bz + dz)] - 1
-        grid.block_near[block, near] = other
+        dx, dy, dz = near // 9 - 1, (near // 3) % 3 - 1, near % 3 - 1
+        other = hash_block[_slot(hash_block, block_key, bx + dx, by + dy, bz + dz)] - 1
+        block_near[block, near] = other
         if other >= 0:
-            grid.block_near[other, 26 - near] = block
+            block_near[other, 26 - near] = block
     return block
 
 
 @njit(cache=True, nogil=True)
-def cell_near(grid: Grid, cell: int, dx: int, dy: int, dz: int) -> int:
+def cell_near(cell_at, cell_block, block_key, block_near, block_cell, cell, dx, dy, dz):
     """The cell at an offset of at most 4 cells from `cell`, or -1 when nothing is there."""
-    at = grid.cell_at[cell]
-    x, y, z = at[0] + dx, at[1] + dy, at[2] + dz
-    block = grid.cell_block[cell]
-    key = grid.block_key[block]
-    near = ((x >> 2) - key[0] + 1) * 9 + ((y >> 2) - key[1] + 1) * 3 + (z >> 2) - key[2] + 1
-    block = grid.block_near[block, near]
+    x, y, z = cell_at[cell, 0] + dx, cell_at[cell, 1] + dy, cell_at[cell, 2] + dz
+    block = cell_block[cell]
+    bx, by, bz = block_key[block, 0], block_key[block, 1], block_key[block, 2]
+    near = ((x >> 2) - bx + 1) * 9 + ((y >> 2) - by + 1) * 3 + (z >> 2) - bz + 1
+    block = block_near[block, near]
     if block < 0:
-        return -1
-    return np.int64(grid.block_cell[block, ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)])
+        return np.int64(-1)
+    return np.int64(block_cell[block, ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)])
 
 
 @njit(cache=True, nogil=True)
-def _mark_stale_around(grid: Grid, cell: int) -> None:
-    """Queue a cell and its 26 neighbours: something in their reach has changed."""
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                near = cell_near(grid, cell, dx, dy, dz)
-                if near >= 0 and grid.cell_stale[near] == 0:
-                    grid.cell_stale[near] = 1
-                    grid.stale[grid.stale_used[0]] = near
-                    grid.stale_used[0] += 1
+def place_in_block(cell_at, cell):
+    """The place of a cell among the 64 of its block."""
+    return ((cell_at[cell, 0] & 3) << 4) | ((cell_at[cell, 1] & 3) << 2) | (cell_at[cell, 2] & 3)
 
 
 @njit(cache=True, nogil=True)
-def insert_points(grid: Grid, xyz_q: Int32Array, first_row: int, cell_limit: int, counted: UInt8Array) -> int:
-    """Put points (k, 3) with rows first_row, first_row + 1, ... into their cells; queue what they reach.
+def insert_points(grid: Grid, points: PointArray, first_row: int, cell_limit: int, counted: UInt8Array) -> int:
+    """Put the points of rows first_row, first_row + 1, ... into their cells; queue what they reach.
+
+    What they reach: their cells, the 26 around each, and the needy cells of the blocks around. A cell that is made
+    later in the round queues itself, so what was spread once in a round needs no second time.
 
     `counted` (k,) comes in as 1 for points to insert and 0 for points to pass over, and goes out with 0 where a cell
     already holds `cell_limit` points. Returns how many points were taken in hand; fewer than k means the grid is full.
     """
-    side = grid.side_q[0]
-    last_cell = np.int64(-1)
+    hash_block, blocks_used, block_key = grid.hash_block, grid.blocks_used, grid.block_key
+    block_near, block_cell, block_needy = grid.block_near, grid.block_cell, grid.block_needy
+    block_round, cells_used, cell_at, cell_block = grid.block_round, grid.cells_used, grid.cell_at, grid.cell_block
+    cell_first, cell_last, cell_count, cell_stale = grid.cell_first, grid.cell_last, grid.cell_count, grid.cell_stale
+    stale_used, stale, chunks_used, chunk_next = grid.stale_used, grid.stale, grid.chunks_used, grid.chunk_next
+    chunk_xyz, chunk_line, chunk_point = grid.chunk_xyz, grid.chunk_line, grid.chunk_point
+    side, this_round = grid.side_q[0], grid.round[0]
+    cell = np.int64(-1)
     lx, ly, lz = np.int64(0), np.int64(0), np.int64(0)
-    for i in range(len(xyz_q)):
+    for i in range(len(counted)):
         if counted[i] == 0:
             continue
-        x, y, z = xyz_q[i, 0] // side, xyz_q[i, 1] // side, xyz_q[i, 2] // side
-        cell = last_cell
+        row = first_row + i
+        px, py, pz = points[row].x, points[row].y, points[row].z
+        x, y, z = px // side, py // side, pz // side
         if cell < 0 or x != lx or y != ly or z != lz:
-            block = _block_at(grid, x >> 2, y >> 2, z >> 2)
+            block = _block_at(hash_block, blocks_used, block_key, block_near, block_cell, x >> 2, y >> 2, z >> 2)
             if block < 0:
                 return i
             place = ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)
-            cell = np.int64(grid.block_cell[block, place])
+            cell = np.int64(block_cell[block, place])
             if cell < 0:
-                cell = grid.cells_used[0]
-                if cell >= len(grid.cell_block):
+                cell = cells_used[0]
+                if cell >= len(cell_block):
                     return i
-                grid.cells_used[0] = cell + 1
-                grid.block_cell[block, place] = cell
-                grid.cell_at[cell, 0], grid.cell_at[cell, 1], grid.cell_at[cell, 2] = x, y, z
-                grid.cell_block[cell] = block
-                grid.cell_first[cell] = -1
-                grid.cell_last[cell] = -1
-                grid.cell_count[cell] = 0
-                grid.cell_stale[cell] = 0
-            _mark_stale_around(grid, cell)
-            last_cell, lx, ly, lz = cell, x, y, z
-        count = grid.cell_count[cell]
+                cells_used[0] = cell + 1
+                block_cell[block, place] = cell
+                cell_at[cell, 0], cell_at[cell, 1], cell_at[cell, 2] = x, y, z
+                cell_block[cell] = block
+                cell_first[cell] = -1
+                cell_last[cell] = -1
+                cell_count[cell] = 0
+                cell_stale[cell] = 0
+            if cell_stale[cell] != SPREAD:
+                for dx in range(-1, 2):
+                    for dy in range(-1, 2):
+                        for dz in range(-1, 2):
+                            near = cell_near(cell_at, cell_block, block_key, block_near, block_cell, cell, dx, dy, dz)
+                            if near >= 0 and cell_stale[near] == 0:
+                                cell_stale[near] = QUEUED
+                                stale[stale_used[0]] = near
+                                stale_used[0] += 1
+                cell_stale[cell] = SPREAD
+                if block_round[block] != this_round:
+                    block_round[block] = this_round
+                    _queue_needy(block_near, block_needy, block_cell, cell_stale, stale, stale_used, block)
+            lx, ly, lz = x, y, z
+        count = cell_count[cell]
         if count >= cell_limit:
             counted[i] = 0
             continue
         place = count % CHUNK
-        chunk = np.int64(grid.cell_last[cell])
+        chunk = np.int64(cell_last[cell])
         if place == 0:
-            chunk = grid.chunks_used[0]
-            if chunk >= len(grid.chunk_next):
+            chunk = chunks_used[0]
+            if chunk >= len(chunk_next):
                 return i
-            grid.chunks_used[0] = chunk + 1
-            grid.chunk_next[chunk] = -1
+            chunks_used[0] = chunk + 1
+            chunk_next[chunk] = -1
             if count == 0:
-                grid.cell_first[cell] = chunk
+                cell_first[cell] = chunk
             else:
-                grid.chunk_next[grid.cell_last[cell]] = chunk
-            grid.cell_last[cell] = chunk
-        grid.chunk_xyz[chunk, 0, place] = xyz_q[i, 0]
-        grid.chunk_xyz[chunk, 1, place] = xyz_q[i, 1]
-        grid.chunk_xyz[chunk, 2, place] = xyz_q[i, 2]
-        grid.chunk_point[chunk, place] = first_row + i
-        grid.cell_count[cell] = count + 1
-    return len(xyz_q)
+                chunk_next[cell_last[cell]] = chunk
+            cell_last[cell] = chunk
+        chunk_xyz[chunk, 0, place] = px
+        chunk_xyz[chunk, 1, place] = py
+        chunk_xyz[chunk, 2, place] = pz
+        chunk_line[chunk, place] = points[row].line
+        chunk_point[chunk, place] = row
+        cell_count[cell] = count + 1
+    return len(counted)
 
 
 @njit(cache=True, nogil=True)
-def mark_all_stale(grid: Grid) -> None:
+def _queue_needy(block_near, block_needy, block_cell, cell_stale, stale, stale_used, block):
+    """Queue the cells around whose points look farther than their neighbours."""
+    for i in range(27):
+        other = block_near[block, i]
+        if other < 0 or block_needy[other] == 0:
+            continue
+        for place in range(BLOCK_CELLS):
+            if (block_needy[other] >> np.uint64(place)) & np.uint64(1):
+                cell = block_cell[other, place]
+                if cell_stale[cell] == 0:
+                    cell_stale[cell] = QUEUED
+                    stale[stale_used[0]] = cell
+                    stale_used[0] += 1
+
+
+@njit(cache=True, nogil=True)
+def take_stale(grid: Grid) -> Int32Array:
+    """Empty the queue: the cells to evaluate, each once; a new round begins."""
+    cell_stale = grid.cell_stale
+    cells = grid.stale[: grid.stale_used[0]].copy()
+    for i in range(len(cells)):
+        cell_stale[cells[i]] = 0
+    grid.stale_used[0] = 0
+    grid.round[0] += 1
+    return cells
+
+
+@njit(cache=True, nogil=True)
+def queue_all(grid: Grid) -> None:
     """Queue every cell."""
+    cell_stale, stale = grid.cell_stale, grid.stale
     for cell in range(grid.cells_used[0]):
-        if grid.cell_stale[cell] == 0:
-            grid.cell_stale[cell] = 1
-            grid.stale[grid.stale_used[0]] = cell
-            grid.stale_used[0] += 1
+        cell_stale[cell] = SPREAD
+        stale[cell] = cell
+    grid.stale_used[0] = grid.cells_used[0]

@@ -12,27 +12,32 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 
-from drivers.scanline import BoolArray, Float64Array
+from drivers.scanline import Float64Array
 from scanner_service.analysis.errors import MapFull
-from scanner_service.analysis.grid import SMALLEST_SIDE_Q, insert_points, mark_all_stale, reserve_grid
+from scanner_service.analysis.grid import SMALLEST_SIDE_Q, insert_points, queue_all, reserve_grid, take_stale
 from scanner_service.analysis.intake import QUANTUM_MM, StoredLine
 from scanner_service.analysis.line_columns import LineColumns
 from scanner_service.analysis.neighbourhood import (
-    LISTED,
     Lines,
-    Points,
+    Rules,
     drop_pass,
     evaluate_cells,
     list_unsettled,
-    reserve_points,
     settle_listed,
 )
 from scanner_service.analysis.passes import Pass, PassBook, PassKey
+from scanner_service.analysis.points import (
+    LISTED,
+    NOT_COUNTED,
+    PointArray,
+    reserve_points,
+    used_radius_mm,
+    write_points,
+)
 from scanner_service.analysis.radius import RadiusSettings, line_radius, point_spacing_mm
 from scanner_service.analysis.snapshot import Int32Array, MapSnapshot, RadiusRule, Unreliable
-
-_CLOSED_AT_ENTRY = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +45,10 @@ class MapSettings:
     """What the live map is told, once, before the first line.
 
     `noise_mm` is the scanner's own standard deviation; `max_normal_error_rad` the predicted error up to which a normal
-    is believed; `max_radius_mm` bounds every radius and is the clearance after which a point is settled (None: the
-    larger of 20 c and twice the radius in force). `needs_lines` asks for two scanlines in a neighbourhood and is off
-    only for clouds without scanlines. `cell_limit` bounds the points that one cell counts, `max_points` the whole map.
+    is believed. A radius that leaves its neighbourhood unreliable grows to at most `max_radius_mm` (None: 20 c) and at
+    most four times itself; where a pass is that far beyond a point, the point is settled. `needs_lines` asks for two
+    scanlines in a neighbourhood and is off only for clouds without scanlines. `cell_limit` bounds the points that one
+    cell counts, `max_points` the whole map.
     """
 
     radius: RadiusSettings = field(default_factory=RadiusSettings)
@@ -86,7 +92,7 @@ class LiveMap:
         self.settings = settings or MapSettings()
         self.origin_mm = np.zeros(3) if origin_mm is None else np.array(origin_mm, dtype=np.float64)
         self.version = 0
-        self._points: Points = reserve_points(self.settings.max_points)
+        self._points: PointArray = reserve_points(self.settings.max_points)
         self._used = 0
         self._grid = reserve_grid(1, 1)
         self._grid_rows = 0
@@ -97,6 +103,13 @@ class LiveMap:
         self._listed_used = 0
         self._pending: list[Int32Array] = []
         self._history: deque[tuple[int, Int32Array]] = deque()
+        self._history_rows = 0
+        self._rules = Rules(
+            needs_lines=self.settings.needs_lines,
+            noise_mm=self.settings.noise_mm,
+            max_error_rad=self.settings.max_normal_error_rad,
+            max_radius_mm=self._max_radius_mm(),
+        )
         self._pool = ThreadPoolExecutor(self.settings.threads) if self.settings.threads > 1 else None
 
     def __len__(self) -> int:
@@ -144,16 +157,11 @@ class LiveMap:
         stationary = of.slot >= 0 and of.stands_still_at(line)
         row = self._lines.append(line, of, spacing, stationary, self.origin_mm)
         first, last = self._used, self._used + len(line.index)
-        points = self._points
-        points.xyz_q[first:last] = line.xyz_q
-        points.line[first:last] = row
-        points.place[first:last] = line.index
-        points.radius_mm[first:last] = common if radius_mm is None else radius_mm
-        points.radius_rule[first:last] = rule
-        _clear_answers(points, first, last)
+        said = Unreliable.NOT_COUNTED if stationary else Unreliable.TOO_FEW
+        radii = np.array([common]) if radius_mm is None else np.ascontiguousarray(radius_mm, dtype=np.float64)
+        write_points(self._points, first, line.xyz_q, line.index, row, radii, int(rule), int(said))
         self._used = last
         if stationary:
-            _leave_out(points, first, np.ones(last - first, dtype=np.bool_))
             self._grid_rows = last
             self._pending.append(np.arange(first, last, dtype=np.int32))
             return Accepted(row, common, 0, {"stationary": last - first} if last > first else {})
@@ -189,7 +197,7 @@ class LiveMap:
     def _follow(self, of: Pass, line: StoredLine) -> None:
         """Advance the front of a pass; when it stops being steady, all it ever reached waits again."""
         if of.advance(line):
-            mark_all_stale(self._grid)
+            queue_all(self._grid)
         self._passes.publish(of, self.origin_mm)
 
     def _reach_at_least(self, radius_mm: float) -> None:
@@ -210,16 +218,24 @@ class LiveMap:
 
     def _insert(self, first: int, last: int) -> int:
         """Put rows into the grid; returns how many a full cell had to leave out."""
-        points = self._points
-        counted = (points.unreliable[first:last] != Unreliable.NOT_COUNTED).astype(np.uint8)
+        said = self._points["unreliable"][first:last]
+        counted = (said != NOT_COUNTED).astype(np.uint8)
         wanted = int(counted.sum())
-        taken = insert_points(self._grid, points.xyz_q[first:last], first, self.settings.cell_limit, counted)
+        taken = insert_points(self._grid, self._points, first, self.settings.cell_limit, counted)
         if taken < last - first:
             raise MapFull("the live map has no cells left: the points are scattered too widely for max_points")
         self._grid_rows = last
-        left_out = counted == 0
-        _leave_out(points, first, left_out)
-        return wanted - int(counted.sum())
+        left_out = wanted - int(counted.sum())
+        if left_out:
+            self._leave_out(first + np.flatnonzero((counted == 0) & (said != NOT_COUNTED)))
+        return left_out
+
+    def _leave_out(self, rows: npt.NDArray[np.int64]) -> None:
+        """Keep rows without counting them."""
+        self._points["unreliable"][rows] = NOT_COUNTED
+        self._points["neighbours"][rows] = 0
+        self._points["open_passes"][rows] &= LISTED
+        self._pending.append(rows.astype(np.int32))
 
     # -- reading ------------------------------------------------------------------------------------------------
 
@@ -228,29 +244,30 @@ class LiveMap:
         self._pending.append(rows)
 
     def refresh(self) -> Int32Array:
-        """Evaluate whatever the lines since the last call reach; returns the rows (m,) whose answer changed, sorted."""
-        grid = self._grid
-        stale = grid.stale[: grid.stale_used[0]].copy()
-        grid.cell_stale[stale] = 0
-        grid.stale_used[0] = 0
-        changed = self._pending
-        self._pending = []
-        if len(stale):
-            changed += self._evaluate(stale)
+        """Evaluate what the lines since the last call reach; returns the rows (m,) whose answer changed, each once."""
+        version = self.version + 1
+        stale = take_stale(self._grid)
+        changed = self._evaluate(stale, version) if len(stale) else []
+        if self._pending:
+            pending = np.unique(np.concatenate(self._pending))
+            changed.append(pending[self._points["changed_at"][pending] != version])
+            self._points["changed_at"][pending] = version
+            self._pending.clear()
         for rows in changed:
-            self._list(rows)
+            self._listed_used = int(list_unsettled(rows, self._points, self._listed, self._listed_used))
         settled = np.empty(self._listed_used, dtype=np.int32)
-        waiting = settle_listed(
-            self._listed[: self._listed_used], self._points, self._line_state(), self._clearance_q(), settled
+        waiting, done = settle_listed(
+            self._listed[: self._listed_used], self._points, self._line_state(), self._rules, version, settled
         )
-        changed.append(settled[: self._listed_used - waiting])
-        self._listed_used = waiting
-        rows = np.unique(np.concatenate(changed))
+        self._listed_used = int(waiting)
+        changed.append(settled[:done])
+        rows = np.concatenate(changed)
         if len(rows):
-            self.version += 1
-            self._history.append((self.version, rows))
-            while len(self._history) > 1 and sum(len(item) for _, item in self._history) > 2 * self._used:
-                self._history.popleft()
+            self.version = version
+            self._history.append((version, rows))
+            self._history_rows += len(rows)
+            while len(self._history) > 1 and self._history_rows > 2 * self._used:
+                self._history_rows -= len(self._history.popleft()[1])
         return rows
 
     def changed_since(self, version: int) -> Int32Array | None:
@@ -259,7 +276,8 @@ class LiveMap:
             return np.empty(0, dtype=np.int32)
         if not self._history or self._history[0][0] > version + 1:
             return None
-        return np.unique(np.concatenate([rows for at, rows in self._history if at > version]))
+        newer = [rows for at, rows in self._history if at > version]
+        return np.sort(newer[0]) if len(newer) == 1 else np.unique(np.concatenate(newer))
 
     def snapshot(self) -> MapSnapshot:
         """Everything the map says, evaluated to the last line taken in; a copy that the engine never touches again."""
@@ -268,30 +286,35 @@ class LiveMap:
 
     def rows(self, rows: Int32Array) -> MapSnapshot:
         """The given rows as they were last evaluated; `line` still refers to the whole line table."""
-        points = self._points
-        radius = points.radius_mm[rows]
-        neighbours = points.neighbours[rows]
-        unreliable = points.unreliable[rows]
-        settled = points.open_passes[rows] == 0
-        normals = points.normal[rows].astype(np.float64)
+        points = self._points[rows]
+        radius = used_radius_mm(points, self._rules.max_radius_mm)
+        neighbours = np.ascontiguousarray(points["neighbours"])
+        unreliable = np.ascontiguousarray(points["unreliable"])
+        counted = unreliable != NOT_COUNTED
+        settled = points["open_passes"] == 0
+        normals = np.column_stack([points["nx"], points["ny"], points["nz"]]).astype(np.float64)
         normals /= np.sqrt((normals * normals).sum(axis=1, keepdims=True))
+        smallest = points["smallest_mm2"].astype(np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            residual = np.sqrt(np.where(neighbours > 3, smallest / (neighbours - 3.0), np.nan))
+            error = np.fmax(residual, self.settings.noise_mm) / np.sqrt(points["middle_mm2"].astype(np.float64))
         return MapSnapshot(
             version=self.version,
             origin_mm=self.origin_mm.copy(),
-            points_mm=self.origin_mm + points.xyz_q[rows] * QUANTUM_MM,
-            line=points.line[rows],
-            index=points.place[rows],
+            points_mm=self.origin_mm + np.column_stack([points["x"], points["y"], points["z"]]) * QUANTUM_MM,
+            line=np.ascontiguousarray(points["line"]),
+            index=np.ascontiguousarray(points["place"]),
             radius_mm=radius,
-            radius_rule=points.radius_rule[rows],
+            radius_rule=np.where(points["growth"] > 0, np.uint8(RadiusRule.GROWN), points["rule"]),
             neighbours=neighbours,
             density_per_mm2=neighbours / (math.pi * radius * radius),
             normals=normals,
             unreliable=unreliable,
             settled=settled,
-            isolated=settled & (neighbours <= 3) & (unreliable != Unreliable.NOT_COUNTED),
-            offset=points.offset[rows].astype(np.float64),
-            residual_mm=points.residual_mm[rows].astype(np.float64),
-            normal_error_rad=points.normal_error_rad[rows].astype(np.float64),
+            isolated=settled & (neighbours <= 3) & counted,
+            offset=np.sqrt(points["offset_sq"].astype(np.float64)),
+            residual_mm=residual,
+            normal_error_rad=np.where(np.isfinite(error) & (neighbours > 3), error, np.nan),
             lines=self._lines.table(),
         )
 
@@ -299,54 +322,20 @@ class LiveMap:
         laser_q, pass_bit = self._lines.kernel_columns()
         return Lines(laser_q, pass_bit, self._passes.heading, self._passes.front_q)
 
-    def _clearance_q(self) -> float:
+    def _max_radius_mm(self) -> float:
         limit = self.settings.max_radius_mm
-        if limit is None:
-            limit = max(20.0 * self.settings.radius.uncertainty_mm, 2.0 * self._largest_radius_mm)
-        return limit / QUANTUM_MM
+        return 20.0 * self.settings.radius.uncertainty_mm if limit is None else limit
 
-    def _list(self, rows: Int32Array) -> None:
-        self._listed_used = int(list_unsettled(rows, self._points, self._listed, self._listed_used))
-
-    def _evaluate(self, stale: Int32Array) -> list[Int32Array]:
+    def _evaluate(self, stale: Int32Array, version: int) -> list[Int32Array]:
         """Evaluate cells, split among the map's threads; every point belongs to one cell, so none is written twice."""
-        lines, clearance_q = self._line_state(), self._clearance_q()
+        lines = self._line_state()
 
         def work(cells: Int32Array) -> Int32Array:
             changed = np.empty(int(self._grid.cell_count[cells].sum()), dtype=np.int32)
-            count = evaluate_cells(
-                cells,
-                self._grid,
-                self._points,
-                lines,
-                self.settings.needs_lines,
-                self.settings.noise_mm,
-                self.settings.max_normal_error_rad,
-                clearance_q,
-                changed,
-            )
+            count = evaluate_cells(cells, self._grid, self._points, lines, self._rules, version, changed)
             return changed[:count]
 
         if self._pool is None or len(stale) < 256:
             return [work(stale)]
         parts: Iterable[Int32Array] = np.array_split(stale, self.settings.threads)
         return list(self._pool.map(work, parts))
-
-
-def _clear_answers(points: Points, first: int, last: int) -> None:
-    """What a row says before it was ever evaluated."""
-    points.neighbours[first:last] = 0
-    points.normal[first:last] = np.nan
-    points.unreliable[first:last] = Unreliable.TOO_FEW
-    points.open_passes[first:last] = _CLOSED_AT_ENTRY
-    points.offset[first:last] = np.nan
-    points.residual_mm[first:last] = np.nan
-    points.normal_error_rad[first:last] = np.nan
-
-
-def _leave_out(points: Points, first: int, left_out: BoolArray) -> None:
-    """Mark rows that are kept but not counted."""
-    rows = first + np.flatnonzero(left_out)
-    points.unreliable[rows] = Unreliable.NOT_COUNTED
-    points.neighbours[rows] = 0
-    points.open_passes[rows] &= LISTED

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from scanner_service.analysis.errors import TooManyPasses
 from scanner_service.analysis.intake import QUANTUM_MM, StoredLine
-from scanner_service.analysis.neighbourhood import MAX_OPEN_PASSES
+from scanner_service.analysis.points import MAX_OPEN_PASSES
 
 PassKey = tuple[str, int, int]
 """(device id, boot id, pass index): what names a pass within a session."""
