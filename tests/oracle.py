@@ -29,7 +29,7 @@ class Oracle:
     def __init__(self, xyz_q, radius_mm, line, laser_mm, noise_mm=0.0, counted=None):
         self.q = np.asarray(xyz_q, dtype=np.int64)
         self.counted = np.ones(len(self.q), bool) if counted is None else np.asarray(counted)
-        self.radius_mm = np.asarray(radius_mm, dtype=np.float64)
+        self.radius_mm = np.array(radius_mm, dtype=np.float64)
         self.line = np.asarray(line)
         self.laser_mm = np.asarray(laser_mm)
         self.noise_mm = noise_mm

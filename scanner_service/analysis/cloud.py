@@ -81,9 +81,14 @@ def analyse_cloud(
         one = global_radius_mm(stored_mm * QUANTUM_MM, sample, uncertainty_mm, limit_mm)
         radius = np.full(len(rows), one)
         notes.append(f"global radius {one:.4f} mm: median of {len(sample)} points (1 in {GLOBAL_SHARE})")
-    live_map = LiveMap(
-        MapSettings(noise_mm=noise_mm, needs_lines=False, max_points=max(1024, len(points_mm)), threads=threads), middle
+    settings = MapSettings(
+        noise_mm=noise_mm,
+        max_radius_mm=0.0,  # the rule's radius stands: a cloud has no lines whose spacing could have misled it
+        needs_lines=False,
+        max_points=max(1024, len(points_mm)),
+        threads=threads,
     )
+    live_map = LiveMap(settings, middle)
     rules = {"fixed": RadiusRule.FIXED, "flexible": RadiusRule.FLEXIBLE, "global": RadiusRule.GLOBAL}
     accepted = live_map.add(line, radius, rules[rule])
     live_map.close_all_passes()

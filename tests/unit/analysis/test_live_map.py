@@ -28,6 +28,41 @@ def new_map(**changes):
     return LiveMap(MapSettings(**({"max_points": 20_000, "noise_mm": NOISE_MM} | changes)))
 
 
+def is_reliable(live, truth):
+    """Section by section: enough points, enough lines, a small predicted error; None when that is on the edge."""
+    two_lines = len(truth.line_counts) == 2 and min(truth.line_counts) >= 2
+    if truth.neighbours < 6 or not (two_lines or len(truth.line_counts) >= 3 or not live.settings.needs_lines):
+        return False
+    limit = live.settings.max_normal_error_rad
+    if not truth.is_comparable or abs(truth.predicted_error_rad - limit) < 1e-9:
+        return None
+    return bool(truth.predicted_error_rad <= limit)
+
+
+def assert_grown_where_needed_only(live, snapshot, oracle, row):
+    """The recorded radius is the first of the ladder that makes the point reliable, else the rule's own."""
+    line = snapshot.lines
+    at = snapshot.line[row]
+    spacing = np.fmax(line.line_spacing_mm[at], line.point_spacing_mm[at])
+    base = math.sqrt(2) * float(spacing) + live.settings.radius.uncertainty_mm
+    limit = live.settings.max_radius_mm or 20 * live.settings.radius.uncertainty_mm
+    limit = max(base, min(limit, 4 * base))
+    ladder = [base]
+    while ladder[-1] < limit:
+        ladder.append(min(base * 1.25 ** len(ladder), limit))
+    used = snapshot.radius_mm[row]
+    assert used in ladder
+    tried = ladder if not snapshot.reliable[row] else ladder[: ladder.index(used)]
+    if not snapshot.reliable[row]:
+        assert used == base
+    kept = oracle.radius_mm[row]
+    for radius in tried:
+        oracle.radius_mm[row] = radius
+        assert is_reliable(live, oracle.at(row)) in (False, None)
+    oracle.radius_mm[row] = kept
+    assert (snapshot.radius_rule[row] == RadiusRule.GROWN) == (used > base)
+
+
 def assert_equals_oracle(live, rows=None):
     """Everything the law promises, for the given rows."""
     snapshot = live.snapshot()
@@ -41,17 +76,14 @@ def assert_equals_oracle(live, rows=None):
             continue
         truth = oracle.at(row)
         assert snapshot.neighbours[row] == truth.neighbours
+        assert_grown_where_needed_only(live, snapshot, oracle, row)
         assert snapshot.density_per_mm2[row] == pytest.approx(
             truth.neighbours / (math.pi * snapshot.radius_mm[row] ** 2)
         )
-        two_lines = len(truth.line_counts) == 2 and min(truth.line_counts) >= 2
-        enough_lines = two_lines or len(truth.line_counts) >= 3 or not live.settings.needs_lines
         if truth.neighbours < 6:
             assert snapshot.unreliable[row] == Unreliable.TOO_FEW
-        elif not enough_lines:
-            assert snapshot.unreliable[row] == Unreliable.SINGLE_LINE
-        elif abs(truth.predicted_error_rad - live.settings.max_normal_error_rad) > 1e-9 and truth.is_comparable:
-            assert snapshot.reliable[row] == (truth.predicted_error_rad <= live.settings.max_normal_error_rad)
+        elif (expected := is_reliable(live, truth)) is not None:
+            assert snapshot.reliable[row] == expected
         if snapshot.reliable[row]:
             assert truth.is_comparable
             assert np.linalg.norm(snapshot.normals[row]) == pytest.approx(1.0)
@@ -88,6 +120,23 @@ def test_after_any_prefix_in_any_order_the_map_equals_the_batch_oracle(lines, st
             assert_equals_oracle(live)
     assert_equals_oracle(live)
     live.close()
+
+
+def test_where_the_rule_reaches_one_line_only_the_radius_grows_and_the_normal_is_right():
+    tilt = math.radians(66.0)  # beyond 59 degrees r_min no longer reaches the next line at a spacing of 0.2 mm
+    rng = np.random.default_rng(5)
+    live = new_map()
+    for line in surface_scan(lambda x, y: math.tan(tilt) * y, lines=25, rng=rng, noise_mm=0.005):
+        live.add(line)
+    live.close_all_passes()
+    snapshot = live.snapshot()
+    middle = (snapshot.line > 5) & (snapshot.line < 19) & (np.abs(snapshot.points_mm[:, 0]) < 1.0)
+    assert (snapshot.radius_rule[middle] == RadiusRule.GROWN).all()
+    assert snapshot.reliable[middle].all()
+    truth = np.array([0.0, -math.sin(tilt), math.cos(tilt)])
+    error = np.arccos(np.clip(snapshot.normals[middle] @ truth, -1, 1))
+    assert np.sqrt((error**2).mean()) < math.radians(2.0)
+    assert_equals_oracle(live, np.flatnonzero(middle)[::7])
 
 
 @settings(max_examples=25, deadline=None)
