@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 import pytest
+import websockets.exceptions
 import websockets.sync.client
 
 from tests.end_to_end.running import wait_for
@@ -46,25 +47,35 @@ class LiveClient:
         self.status = None
         self.regions = None
         self.credit = 0
+        self.is_finished = False
 
     def listen(self, until):
         """Take messages until the condition holds."""
 
         def step():
-            if self.credit == 0:
-                self.socket.send(json.dumps({"credit": 8}))
-                self.credit = 8
-            message = self.socket.recv(timeout=10)
-            if isinstance(message, str):
-                told = json.loads(message)
-                assert told["type"] in ("status", "regions"), told
-                setattr(self, told["type"], told)
-            else:
-                self.credit -= 1
-                self._take(message)
+            try:
+                self._hear()
+            except websockets.exceptions.ConnectionClosedOK as closed:
+                assert closed.rcvd.code == 1000
+                self.is_finished = True
+                assert until(self), "the service said that everything was sent"
             return until(self)
 
         wait_for(step, "the live stream")
+
+    def _hear(self):
+        if self.credit == 0:
+            self.socket.send(json.dumps({"credit": 8}))
+            self.credit = 8
+        message = self.socket.recv(timeout=10)
+        if isinstance(message, str):
+            told = json.loads(message)
+            assert told["type"] in ("status", "regions"), told
+            setattr(self, told["type"], told)
+        else:
+            assert self.status is not None, "points came before the first status"
+            self.credit -= 1
+            self._take(message)
 
     def _take(self, message):
         magic, kind, flags, version, based_on, n, _skipped, total, _ = HEADER.unpack_from(message)
@@ -90,10 +101,12 @@ def test_a_plate_is_scanned_streamed_and_found_good(running):
     session_id = service.create(**device(simulator))
     with live_client(service, session_id) as client:
         service.start(session_id)
-        client.listen(until=lambda c: c.status and c.status["state"] == "stopped" and c.regions is not None)
-        status = service.status(session_id)
-        total = status["points"]
-        client.listen(until=lambda c: len(c.points) == total and all(s & 2 for _, _, s in c.points.values()))
+        client.listen(until=lambda c: c.is_finished)
+    status = service.status(session_id)
+    total = status["points"]
+    assert (client.status["state"], client.status["points"], len(client.points)) == ("stopped", total, total)
+    assert client.regions["regions"] == []
+    assert all(state & 2 for _, _, state in client.points.values())
 
     losses = status["losses"]
     assert losses["device"]["lines"]["sent"] == status["lines"] == 81
@@ -177,6 +190,10 @@ def test_a_session_survives_kill_9_with_everything_that_was_acknowledged(running
     assert status["durable"]["SIM-0001"]["line_index"] >= acknowledged["line_index"]
     rows = read_ply(service.client.get(f"/api/v1/sessions/{session_id}/export/points.ply").content)
     assert len(rows) == status["points"] == listed[0]["points"]
+    with live_client(service, session_id) as client:
+        client.listen(until=lambda c: c.is_finished)
+    assert (client.status["state"], len(client.points)) == ("interrupted", len(rows))
+    assert client.regions is not None
     first = service.client.get(f"/api/v1/sessions/{session_id}/scanlines", params={"limit": 1}).json()["scanlines"][0]
     np.testing.assert_array_equal(
         first["points_mm"], np.column_stack([rows["x"], rows["y"], rows["z"]])[: len(first["index"])]
@@ -231,9 +248,15 @@ def test_pushed_scanlines_are_answered_when_durable_and_stored_once(running):
     assert {line["outcome"] for line in again.json()["lines"]} == {"duplicate"}
     status = service.client.post(f"/api/v1/sessions/{session_id}/stop").json()
     assert (status["state"], status["lines"], status["points"]) == ("stopped", 23, 20 * 34)
-    assert status["losses"]["points"]["dropped"] == {"dropout": 20 * 6}
+    with live_client(service, session_id) as client:  # more may be pushed later: the stream stays open
+        client.listen(until=lambda c: len(c.points) == 20 * 34 and c.regions)
+        service.start(session_id)
+        service.client.post(url, json={"lines": [lines[0] | {"line_index": 20}]})
+        client.listen(until=lambda c: c.status["state"] == "scanning" and len(c.points) == 21 * 34)
+    status = service.client.post(f"/api/v1/sessions/{session_id}/stop").json()
+    assert status["losses"]["points"]["dropped"] == {"dropout": 21 * 6}
     summary = service.client.get(f"/api/v1/sessions/{session_id}/summary").json()
-    assert summary["scanlines"] == 20
+    assert summary["scanlines"] == 21
     bad = service.client.post(url, content=json.dumps({"lines": [lines[0] | {"line_spacing_mm": -1}]}))
     assert bad.status_code in (415, 422)
     nan = io.BytesIO(b'{"lines": [{"line_index": NaN}]}').read()

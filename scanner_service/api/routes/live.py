@@ -1,6 +1,7 @@
 """The live stream of a session over a WebSocket: points as credit allows, status and regions as they change."""
 
 import asyncio
+import contextlib
 import json
 from collections import deque
 
@@ -16,6 +17,7 @@ from scanner_service.api.scopes import accepted_subprotocol, require
 from scanner_service.sessions.errors import SessionError
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.session import LiveSession
+from scanner_service.sessions.sources import PushSource
 from scanner_service.storage.errors import RecordError
 
 router = APIRouter()
@@ -23,7 +25,7 @@ UPDATE_PERIOD_S = 1 / 30
 STATUS_PERIOD_S = 0.5
 MAX_CREDIT = 64
 MAX_REQUEST_BYTES = 1024
-GOING_AWAY, POLICY, NOT_FOUND = 1001, 1008, 4404
+FINISHED, GOING_AWAY, POLICY, NOT_FOUND = 1000, 1001, 1008, 4404
 
 
 class _Credit:
@@ -45,7 +47,7 @@ class _Credit:
 
 @router.websocket("/api/v1/sessions/{session_id}/live", dependencies=[Depends(require(Role.VIEWER))])
 async def live(websocket: WebSocket, session_id: str) -> None:
-    """Serve one client until it leaves or the session is closed."""
+    """Serve one client until it leaves, has everything there will ever be, or the session is closed."""
     await websocket.accept(subprotocol=accepted_subprotocol(websocket))
     try:
         session = await run_in_threadpool(websocket.app.state.service.book.get, session_id)
@@ -53,18 +55,25 @@ async def live(websocket: WebSocket, session_id: str) -> None:
         await _say(websocket, {"type": "error", "detail": str(error)})
         await websocket.close(NOT_FOUND)
         return
-    credit = _Credit()
-    tasks = [
-        asyncio.create_task(_listen(websocket, credit)),
-        asyncio.create_task(_send_points(websocket, session, credit)),
-        asyncio.create_task(_send_status(websocket, session)),
+    credit, greeted = _Credit(), asyncio.Event()
+    listening = asyncio.create_task(_listen(websocket, credit))
+    sending = [
+        asyncio.create_task(_send_status(websocket, session, greeted)),
+        asyncio.create_task(_send_points(websocket, session, credit, greeted)),
     ]
-    done, running = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-    for task in running:
+    all_sent = asyncio.gather(*sending)
+    done, _ = await asyncio.wait((listening, all_sent), return_when=asyncio.FIRST_COMPLETED)
+    for task in (listening, *sending):
         task.cancel()
-    await asyncio.gather(*running, return_exceptions=True)
-    for task in done:
-        await _part(websocket, task.exception())
+    await asyncio.gather(listening, *sending, all_sent, return_exceptions=True)
+    ended = listening if listening in done else all_sent
+    await _part(websocket, ended.exception())
+
+
+def _is_final(session: LiveSession) -> bool:
+    """The scan is over and judged, and nobody can start it again: what is said of it now stays so."""
+    is_over = session.state in ("stopped", "failed", "interrupted") and session.results() is not None
+    return is_over and not isinstance(session.source, PushSource)  # pushed lines may go on at any time
 
 
 async def _part(websocket: WebSocket, error: BaseException | None) -> None:
@@ -76,7 +85,10 @@ async def _part(websocket: WebSocket, error: BaseException | None) -> None:
         case ValueError():
             await _say(websocket, {"type": "error", "detail": str(error)})
             await websocket.close(POLICY)
-        case None | WebSocketDisconnect() | RuntimeError():  # the client left; starlette says it in two ways
+        case None:
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                await websocket.close(FINISHED)
+        case WebSocketDisconnect() | RuntimeError():  # the client left; starlette says it in two ways
             pass
         case _:
             raise error
@@ -96,16 +108,20 @@ async def _listen(websocket: WebSocket, credit: _Credit) -> None:
         credit.grant(more)
 
 
-async def _send_points(websocket: WebSocket, session: LiveSession, credit: _Credit) -> None:
-    """Send what changed, at most 30 times a second, whenever there is credit."""
+async def _send_points(websocket: WebSocket, session: LiveSession, credit: _Credit, greeted: asyncio.Event) -> None:
+    """Send what changed, at most 30 times a second, whenever there is credit; until nothing can change any more."""
     version = 0
     waiting: deque[bytes] = deque()
     has_sent = False
+    await greeted.wait()
     while True:
         await credit.granted.wait()
         if not waiting:
+            is_final = _is_final(session)  # looked at before the question: its answer is the last word then
             update = await asyncio.wrap_future(session.update_since(version))
             if len(update.rows) == 0 and has_sent:
+                if is_final:
+                    return
                 await asyncio.sleep(UPDATE_PERIOD_S)
                 continue
             version = update.version
@@ -117,17 +133,21 @@ async def _send_points(websocket: WebSocket, session: LiveSession, credit: _Cred
         await asyncio.sleep(UPDATE_PERIOD_S)
 
 
-async def _send_status(websocket: WebSocket, session: LiveSession) -> None:
-    """Send the status about twice a second, and the regions when there is a new verdict."""
+async def _send_status(websocket: WebSocket, session: LiveSession, greeted: asyncio.Event) -> None:
+    """Send the status about twice a second, and the regions when there is a new verdict; until both are final."""
     told: Results | None = None
     while True:
+        is_final = _is_final(session)
         status = await asyncio.to_thread(status_answer, session)
         await _say(websocket, {"type": "status", **status})
+        greeted.set()
         results = session.results()
         if results is not None and results is not told:
             regions = [region.to_dict() for region in results.report.regions]
             await _say(websocket, {"type": "regions", "version": results.snapshot.version, "regions": regions})
             told = results
+        if is_final:
+            return
         await asyncio.sleep(STATUS_PERIOD_S)
 
 
