@@ -179,7 +179,7 @@ def insert_points(grid: Grid, points: PointArray, first_row: int, cell_limit: in
     stale_used, stale, chunks_used, chunk_next = grid.stale_used, grid.stale, grid.chunks_used, grid.chunk_next
     chunk_xyz, chunk_line, chunk_point = grid.chunk_xyz, grid.chunk_line, grid.chunk_point
     side, this_round = grid.side_q[0], grid.round[0]
-    cell = np.int64(-1)
+    cell, block = np.int64(-1), np.int64(-1)
     lx, ly, lz = np.int64(0), np.int64(0), np.int64(0)
     for i in range(len(counted)):
         if counted[i] == 0:
@@ -188,9 +188,10 @@ def insert_points(grid: Grid, points: PointArray, first_row: int, cell_limit: in
         px, py, pz = points[row].x, points[row].y, points[row].z
         x, y, z = px // side, py // side, pz // side
         if cell < 0 or x != lx or y != ly or z != lz:
-            block = _block_at(hash_block, blocks_used, block_key, block_near, block_cell, x >> 2, y >> 2, z >> 2)
-            if block < 0:
-                return i
+            if cell < 0 or x >> 2 != lx >> 2 or y >> 2 != ly >> 2 or z >> 2 != lz >> 2:
+                block = _block_at(hash_block, blocks_used, block_key, block_near, block_cell, x >> 2, y >> 2, z >> 2)
+                if block < 0:
+                    return i
             place = ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)
             cell = np.int64(block_cell[block, place])
             if cell < 0:

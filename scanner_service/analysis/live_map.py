@@ -94,6 +94,7 @@ class LiveMap:
         self.version = 0
         self._points: PointArray = reserve_points(self.settings.max_points)
         self._used = 0
+        self._first_new = 0  # rows from here on were never evaluated
         self._grid = reserve_grid(1, 1)
         self._grid_rows = 0
         self._largest_radius_mm = 0.0
@@ -198,6 +199,7 @@ class LiveMap:
         """Advance the front of a pass; when it stops being steady, all it ever reached waits again."""
         if of.advance(line):
             queue_all(self._grid)
+            self._first_new = 0
         self._passes.publish(of, self.origin_mm)
 
     def _reach_at_least(self, radius_mm: float) -> None:
@@ -248,6 +250,7 @@ class LiveMap:
         version = self.version + 1
         stale = take_stale(self._grid)
         changed = self._evaluate(stale, version) if len(stale) else []
+        self._first_new = self._used
         if self._pending:
             pending = np.unique(np.concatenate(self._pending))
             changed.append(pending[self._points["changed_at"][pending] != version])
@@ -320,7 +323,7 @@ class LiveMap:
 
     def _line_state(self) -> Lines:
         laser_q, pass_bit = self._lines.kernel_columns()
-        return Lines(laser_q, pass_bit, self._passes.heading, self._passes.front_q)
+        return Lines(laser_q, pass_bit, self._passes.open_bits, self._passes.heading, self._passes.front_q)
 
     def _max_radius_mm(self) -> float:
         limit = self.settings.max_radius_mm
@@ -332,7 +335,9 @@ class LiveMap:
 
         def work(cells: Int32Array) -> Int32Array:
             changed = np.empty(int(self._grid.cell_count[cells].sum()), dtype=np.int32)
-            count = evaluate_cells(cells, self._grid, self._points, lines, self._rules, version, changed)
+            count = evaluate_cells(
+                cells, self._grid, self._points, lines, self._rules, version, self._first_new, changed
+            )
             return changed[:count]
 
         if self._pool is None or len(stale) < 256:

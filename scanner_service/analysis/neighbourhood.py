@@ -26,11 +26,19 @@ MIN_POINTS = 6
 MIN_GAP = 1e-3
 """A plane is determined where lambda2 - lambda3 >= MIN_GAP * lambda1 (the reach of the 1e-6 rad promise)."""
 
-_NARROW_SIDE_Q = 13000
-"""Up to this cell side the squared distance of any two points of neighbouring cells fits 32 bits."""
+_EXACT = 2.0**52
+"""Whole numbers up to here are exact in float64, and so are their sums in any order."""
 
-_INT32_SUM = 2.0**31
-_NO_LINE = np.int32(2**31 - 1)
+_EXACT_SIDE_Q = 2**23
+"""Up to this cell side the squared distance of any two points gathered is such a number."""
+
+_EXACT_LINES = 2**19
+"""Up to this many scanlines the sums that tell one line from several are, too."""
+
+_VECTOR = 16
+"""The candidates are padded to a multiple of this, so that vector registers run full."""
+
+_FAR = 1e15
 
 
 class Rules(NamedTuple):
@@ -46,12 +54,14 @@ class Lines(NamedTuple):
     """What the kernel reads of scanlines and passes.
 
     `laser_q` (L, 3) laser positions in quanta from the origin; `pass_bit` (L,) the bit of the line's pass while that
-    is open, else 0. For each of the MAX_OPEN_PASSES: `heading` (., 3) the unit normal of its laser planes in the
-    direction of travel, NaN when unknown or not steady, and `front_q` (.,) how far along it the latest plane lies.
+    is open, else 0; `open_bits` (1,) all of these together. For each of the MAX_OPEN_PASSES: `heading` (., 3) the unit
+    normal of its laser planes in the direction of travel, NaN when unknown or not steady, and `front_q` (.,) how far
+    along it the latest plane lies.
     """
 
     laser_q: npt.NDArray[np.float64]
     pass_bit: UInt8Array
+    open_bits: UInt8Array
     heading: npt.NDArray[np.float64]
     front_q: npt.NDArray[np.float64]
 
@@ -70,32 +80,47 @@ def evaluate_cells(
     lines: Lines,
     rules: Rules,
     version: int,
+    first_new: int,
     changed: Int32Array,
 ) -> int:
-    """Evaluate every point of the given cells; put the rows whose answer changed into `changed`, return how many.
+    """Evaluate the points of the given cells; put the rows whose answer changed into `changed`, return how many.
+
+    Rows from `first_new` on are new since the last evaluation. An older point that none of them reaches is passed
+    over, since nothing in its neighbourhood has changed; with 0 every point is evaluated.
 
     The sums are exact integers of offsets from the point itself, so the answer depends on the set of points alone.
     Where, and only where, the rule's radius leaves a point unreliable, its radius grows until it is reliable or
     r_max is reached; in the latter case the answer of the rule's own radius stands.
     """
-    cell_at, cell_block, cell_first, cell_count = grid.cell_at, grid.cell_block, grid.cell_first, grid.cell_count
+    cell_at, cell_block, cell_count = grid.cell_at, grid.cell_block, grid.cell_count
+    cell_first, cell_last = grid.cell_first, grid.cell_last
     block_key, block_near, block_cell, block_needy = grid.block_key, grid.block_near, grid.block_cell, grid.block_needy
     chunk_next, chunk_xyz, chunk_line = grid.chunk_next, grid.chunk_xyz, grid.chunk_line
     chunk_point, side_mm = grid.chunk_point, grid.side_q[0] * QUANTUM_MM
     laser_q, pass_bit, heading, front_q = lines.laser_q, lines.pass_bit, lines.heading, lines.front_q
-    narrow = grid.side_q[0] < _NARROW_SIDE_Q
-    has_passes = pass_bit.any()
+    is_exact = grid.side_q[0] < _EXACT_SIDE_Q and len(pass_bit) < _EXACT_LINES
     max_radius_mm = rules.max_radius_mm
     n_changed = 0
-    found = np.empty(729, dtype=np.int64)
-    near = np.empty((4, 512), dtype=np.int32)
-    wide = np.empty((4, 512), dtype=np.int32)
+    found = np.empty(27, dtype=np.int64)
+    far = np.empty(729, dtype=np.int64)
+    fresh = np.empty((3, 512))
+    near = np.empty((4, 512))
+    wide = np.empty((4, 512))
+    open_bits = np.uint8(lines.open_bits[0])
     for i in range(len(cells)):
         cell = np.int64(cells[i])
         n_found, n = _cells_around(cell_at, cell_block, cell_count, block_key, block_near, block_cell, cell, 1, found)
-        if n > near.shape[1]:
-            near = np.empty((4, 2 * n), dtype=np.int32)
-        _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_found, near)
+        if n + _VECTOR > near.shape[1]:
+            near = np.empty((4, 2 * n + _VECTOR))
+            fresh = np.empty((3, 2 * n + _VECTOR))
+        bit = np.uint64(1) << np.uint64(place_in_block(cell_at, cell))
+        was_needy = block_needy[cell_block[cell]] & bit != 0
+        n_fresh = np.int64(0)
+        if not was_needy:
+            n_fresh = _gather_fresh(
+                chunk_next, chunk_xyz, chunk_point, cell_first, cell_last, cell_count, found, n_found, first_new, fresh
+            )
+        is_gathered = False
         n_wide = np.int64(-1)
         needy = False
         chunk = cell_first[cell]
@@ -104,8 +129,13 @@ def evaluate_cells(
             here = min(left, CHUNK)
             for j in range(here):
                 row = chunk_point[chunk, j]
+                if row < first_new and not was_needy and not _is_reached(points, row, fresh, n_fresh):
+                    continue
+                if not is_gathered:
+                    _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_found, near)
+                    is_gathered = True
                 base_mm = points[row].radius_mm
-                answer = _answer(points, row, near, n, base_mm, narrow, rules)
+                answer = _answer(points, row, near, n, base_mm, is_exact, rules)
                 step = 0
                 if answer[1] != 0:
                     limit_mm = _radius_limit_mm(base_mm, max_radius_mm)
@@ -113,34 +143,70 @@ def evaluate_cells(
                         needy = True
                         if n_wide < 0:
                             rings = min(4, math.ceil(limit_mm / side_mm))
-                            n_found, n_wide = _cells_around(
-                                cell_at, cell_block, cell_count, block_key, block_near, block_cell, cell, rings, found
+                            n_far, n_wide = _cells_around(
+                                cell_at, cell_block, cell_count, block_key, block_near, block_cell, cell, rings, far
                             )
-                            if n_wide > wide.shape[1]:
-                                wide = np.empty((4, 2 * n_wide), dtype=np.int32)
-                            _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_found, wide)
-                        step, grown = _grow(points, row, wide, n_wide, base_mm, limit_mm, rules)
+                            if n_wide + _VECTOR > wide.shape[1]:
+                                wide = np.empty((4, 2 * n_wide + _VECTOR))
+                            _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, far, n_far, wide)
+                        step, grown = _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules)
                         if step > 0:
                             answer = grown
-                passes = np.uint8(0)
-                if has_passes:
+                passes = pass_bit[points[row].line]
+                if open_bits & ~passes:
                     if step > 0:
                         reach_mm = min(base_mm * GROWTH**step, limit_mm)
                         passes = _passes_in_reach(points, row, wide, n_wide, reach_mm, pass_bit)
                     else:
                         passes = _passes_in_reach(points, row, near, n, base_mm, pass_bit)
-                    passes = _not_gone_by(passes, points, row, heading, front_q, max_radius_mm)
+                passes = _not_gone_by(passes, points, row, heading, front_q, max_radius_mm)
                 if _store(points, row, answer, step, passes, laser_q, version):
                     changed[n_changed] = row
                     n_changed += 1
             left -= here
             chunk = chunk_next[chunk]
-        bit = np.uint64(1) << np.uint64(place_in_block(cell_at, cell))
         if needy:
             block_needy[cell_block[cell]] |= bit
-        else:
+        elif was_needy:
             block_needy[cell_block[cell]] &= ~bit
     return n_changed
+
+
+@njit(cache=True, nogil=True)
+def _gather_fresh(
+    chunk_next, chunk_xyz, chunk_point, cell_first, cell_last, cell_count, found, n_found, first_new, fresh
+):
+    """Copy the coordinates of those points in the cells found that are new, and pad; returns how many."""
+    n = np.int64(0)
+    for k in range(n_found):
+        cell = found[k]
+        if chunk_point[cell_last[cell], (cell_count[cell] - 1) % CHUNK] < first_new:
+            continue  # rows of a cell ascend: its last is its newest
+        chunk = cell_first[cell]
+        left = cell_count[cell]
+        while left > 0:
+            here = min(left, CHUNK)
+            for j in range(here):
+                if chunk_point[chunk, j] >= first_new:
+                    fresh[0, n] = chunk_xyz[chunk, 0, j]
+                    fresh[1, n] = chunk_xyz[chunk, 1, j]
+                    fresh[2, n] = chunk_xyz[chunk, 2, j]
+                    n += 1
+            left -= here
+            chunk = chunk_next[chunk]
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _is_reached(points, row, fresh, n_fresh):
+    """True when a new point lies within the radius of a point."""
+    x, y, z = float(points[row].x), float(points[row].y), float(points[row].z)
+    reach = math.floor((points[row].radius_mm / QUANTUM_MM) ** 2)
+    reached = False
+    for k in range(n_fresh):
+        dx, dy, dz = fresh[0, k] - x, fresh[1, k] - y, fresh[2, k] - z
+        reached |= dx * dx + dy * dy + dz * dz <= reach + 1.0
+    return reached
 
 
 @njit(cache=True, nogil=True)
@@ -161,51 +227,53 @@ def _cells_around(cell_at, cell_block, cell_count, block_key, block_near, block_
 
 @njit(cache=True, nogil=True)
 def _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_found, buffer):
-    """Copy x, y, z and line of every point in the cells found."""
+    """Copy x, y, z and line of every point in the cells found, and pad."""
     n = 0
     for k in range(n_found):
         chunk = cell_first[found[k]]
         left = cell_count[found[k]]
         while left > 0:
             here = min(left, CHUNK)
-            for j in range(here):
-                buffer[0, n] = chunk_xyz[chunk, 0, j]
-                buffer[1, n] = chunk_xyz[chunk, 1, j]
-                buffer[2, n] = chunk_xyz[chunk, 2, j]
-                buffer[3, n] = chunk_line[chunk, j]
-                n += 1
+            for j in range(CHUNK):  # a whole chunk at once: what is beyond its end is overwritten or padded
+                buffer[0, n + j] = chunk_xyz[chunk, 0, j]
+                buffer[1, n + j] = chunk_xyz[chunk, 1, j]
+                buffer[2, n + j] = chunk_xyz[chunk, 2, j]
+                buffer[3, n + j] = chunk_line[chunk, j]
+            n += here
             left -= here
             chunk = chunk_next[chunk]
+    for j in range(_VECTOR):
+        buffer[0, n + j] = _FAR
+        buffer[1, n + j], buffer[2, n + j], buffer[3, n + j] = 0.0, 0.0, 0.0
 
 
 @njit(cache=True, nogil=True)
-def _grow(points, row, wide, n_wide, base_mm, limit_mm, rules):
+def _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules):
     """The first step at which the grown radius makes the point reliable, with its answer; step 0 when none does."""
     step = 0
     radius_mm = base_mm
-    answer = _answer(points, row, wide, 0, base_mm, False, rules)
+    answer = _answer(points, row, wide, 0, base_mm, is_exact, rules)
     while radius_mm < limit_mm:
         step += 1
         radius_mm = min(base_mm * GROWTH**step, limit_mm)
-        answer = _answer(points, row, wide, n_wide, radius_mm, False, rules)
+        answer = _answer(points, row, wide, n_wide, radius_mm, is_exact, rules)
         if answer[1] == 0:
             return step, answer
     return 0, answer
 
 
 @njit(cache=True, nogil=True)
-def _answer(points, row, local, n, radius_mm, narrow, rules):
+def _answer(points, row, local, n, radius_mm, is_exact, rules):
     """(Np, reason, nx, ny, nz, lambda2 mm2, lambda3 mm2, offset^2) of a point with this radius."""
     reach = math.floor((radius_mm / QUANTUM_MM) ** 2)
-    fits = narrow and reach < _INT32_SUM
-    if fits:
-        moments = _moments_narrow(points, row, local, n, np.int32(reach))
-        fits = float(moments[0]) * reach < _INT32_SUM
-    if not fits:
-        moments = _moments_wide(points, row, local, n, np.int64(reach))
-    count, own, low, high, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz = moments
-    total = float(count)
-    fx, fy, fz = float(sx), float(sy), float(sz)
+    px, py, pz, own = points[row].x, points[row].y, points[row].z, points[row].line
+    if is_exact:
+        sums = _sums(local, n, float(px), float(py), float(pz), float(own), float(reach))
+        is_exact = sums[0] * reach < _EXACT
+    if not is_exact:
+        sums = _sums_of_integers(local, n, px, py, pz, own, reach)
+    total, others, first, second, fx, fy, fz, sxx, sxy, sxz, syy, syz, szz = sums
+    count = int(total)
     per = 1.0 / max(total, 1.0)
     # Np times the central moments, from exact sums: no digits are lost far from the origin.
     ax, ay, az, l1, l2, l3 = smallest_axis(
@@ -218,12 +286,15 @@ def _answer(points, row, local, n, radius_mm, narrow, rules):
     )
     to_mm2 = QUANTUM_MM * QUANTUM_MM
     l2_mm2, l3_mm2 = l2 * to_mm2, l3 * to_mm2
-    two_lines = low == high and own >= 2 and count - own >= 2
-    three_lines = high >= 0 and low < high
+    # `first` and `second` are the sums of (line - own line) and of its square over the points of other lines: these
+    # are all of one line when the mean is a whole number and the spread is nothing.
+    mean = first / max(others, 1.0)
+    one_other = others > 0.0 and mean == math.floor(mean) and second == first * mean
+    enough_lines = others > 0.0 and (not one_other or (others >= 2.0 and total - others >= 2.0))
     reason = 0
     if count < MIN_POINTS:
         reason = _TOO_FEW
-    elif rules.needs_lines and not (two_lines or three_lines):
+    elif rules.needs_lines and not enough_lines:
         reason = _SINGLE_LINE
     else:
         # sigma / sqrt(lambda2) <= limit, sigma the larger of the scanner's noise and the residual, all squared
@@ -236,67 +307,54 @@ def _answer(points, row, local, n, radius_mm, narrow, rules):
     return count, reason, ax, ay, az, l2_mm2, l3_mm2, offset
 
 
-@njit(cache=True, nogil=True)
-def _moments_narrow(points, row, local, n, reach):
-    """Counts and moments of the candidates within reach, in 32 bits and without a branch, for vector registers."""
-    px, py, pz, own = points[row].x, points[row].y, points[row].z, points[row].line
-    count, own_count = np.int32(0), np.int32(0)
-    low, high = _NO_LINE, np.int32(-1)
-    sx, sy, sz = np.int32(0), np.int32(0), np.int32(0)
-    sxx, sxy, sxz = np.int32(0), np.int32(0), np.int32(0)
-    syy, syz, szz = np.int32(0), np.int32(0), np.int32(0)
-    for k in range(n):
-        x, y, z = np.int32(local[0, k] - px), np.int32(local[1, k] - py), np.int32(local[2, k] - pz)
-        xx, yy, zz = np.int32(x * x), np.int32(y * y), np.int32(z * z)
-        inside = np.int32(xx + yy + zz) <= reach
-        line = local[3, k]
-        x, y, z = (x, y, z) if inside else (np.int32(0), np.int32(0), np.int32(0))
-        is_own = inside and line == own
-        is_other = inside and line != own
-        count = np.int32(count + np.int32(inside))
-        own_count = np.int32(own_count + np.int32(is_own))
-        low = min(low, line if is_other else _NO_LINE)
-        high = max(high, line if is_other else np.int32(-1))
-        sx, sy, sz = np.int32(sx + x), np.int32(sy + y), np.int32(sz + z)
-        sxx, sxy, sxz = np.int32(sxx + x * x), np.int32(sxy + x * y), np.int32(sxz + x * z)
-        syy, syz, szz = np.int32(syy + y * y), np.int32(syz + y * z), np.int32(szz + z * z)
-    return (
-        np.int64(count),
-        np.int64(own_count),
-        low,
-        high,
-        np.int64(sx),
-        np.int64(sy),
-        np.int64(sz),
-        np.int64(sxx),
-        np.int64(sxy),
-        np.int64(sxz),
-        np.int64(syy),
-        np.int64(syz),
-        np.int64(szz),
-    )
+@njit(cache=True, nogil=True, fastmath={"reassoc", "nsz", "nnan", "contract"})
+def _sums(local, n, px, py, pz, own, reach):
+    """Counts and moments of the candidates within reach, without a branch, for vector registers.
+
+    Everything is a whole number below 2^53, so that float64 is exact in any order (and nothing is ever NaN).
+    """
+    count, others, first, second = 0.0, 0.0, 0.0, 0.0
+    sx, sy, sz = 0.0, 0.0, 0.0
+    sxx, sxy, sxz, syy, syz, szz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    padded = ((n + _VECTOR - 1) // _VECTOR) * _VECTOR
+    for k in range(padded):
+        x, y, z = local[0, k] - px, local[1, k] - py, local[2, k] - pz
+        inside = 1.0 if x * x + y * y + z * z <= reach else 0.0
+        x, y, z = x * inside, y * inside, z * inside
+        line = (local[3, k] - own) * inside
+        count += inside
+        others += 1.0 if line != 0.0 else 0.0
+        first += line
+        second += line * line
+        sx += x
+        sy += y
+        sz += z
+        sxx += x * x
+        sxy += x * y
+        sxz += x * z
+        syy += y * y
+        syz += y * z
+        szz += z * z
+    return count, others, first, second, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz
 
 
 @njit(cache=True, nogil=True)
-def _moments_wide(points, row, local, n, reach):
-    """The same as `_moments_narrow` for any radius, in 64 bits."""
-    px, py, pz = np.int64(points[row].x), np.int64(points[row].y), np.int64(points[row].z)
-    own = points[row].line
-    count, own_count = np.int64(0), np.int64(0)
-    low, high = _NO_LINE, np.int32(-1)
+def _sums_of_integers(local, n, px, py, pz, own, reach):
+    """The same as `_sums` for any radius and any number of lines, in 64-bit integers; the lines' sums are 0, 1 or 2."""
+    count, others = np.int64(0), np.int64(0)
+    other_line, several = np.int64(-1), False
     sx, sy, sz = np.int64(0), np.int64(0), np.int64(0)
     sxx, sxy, sxz = np.int64(0), np.int64(0), np.int64(0)
     syy, syz, szz = np.int64(0), np.int64(0), np.int64(0)
     for k in range(n):
-        x, y, z = local[0, k] - px, local[1, k] - py, local[2, k] - pz
+        x, y, z = np.int64(local[0, k]) - px, np.int64(local[1, k]) - py, np.int64(local[2, k]) - pz
         if x * x + y * y + z * z <= reach:
-            line = local[3, k]
+            line = np.int64(local[3, k])
             count += 1
-            if line == own:
-                own_count += 1
-            else:
-                low = min(low, line)
-                high = max(high, line)
+            if line != own:
+                others += 1
+                several = several or (other_line >= 0 and line != other_line)
+                other_line = line
             sx += x
             sy += y
             sz += z
@@ -306,7 +364,22 @@ def _moments_wide(points, row, local, n, reach):
             syy += y * y
             syz += y * z
             szz += z * z
-    return count, own_count, low, high, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz
+    spread = 1.0 if several else 0.0
+    return (
+        float(count),
+        float(others),
+        float(others),
+        float(others) + spread,
+        float(sx),
+        float(sy),
+        float(sz),
+        float(sxx),
+        float(sxy),
+        float(sxz),
+        float(syy),
+        float(syz),
+        float(szz),
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -366,9 +439,9 @@ def _passes_in_reach(points, row, local, n, radius_mm, pass_bit):
     bits = pass_bit[points[row].line]
     reach = np.int64(math.floor((radius_mm / QUANTUM_MM) ** 2))
     for k in range(n):
-        bit = pass_bit[local[3, k]]
+        bit = pass_bit[np.int64(local[3, k])]
         if bit & ~bits:
-            x, y, z = local[0, k] - px, local[1, k] - py, local[2, k] - pz
+            x, y, z = np.int64(local[0, k]) - px, np.int64(local[1, k]) - py, np.int64(local[2, k]) - pz
             if x * x + y * y + z * z <= reach:
                 bits |= bit
     return bits

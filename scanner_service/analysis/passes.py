@@ -77,6 +77,7 @@ class PassBook:
         self._free = list(range(MAX_OPEN_PASSES))[::-1]
         self.heading = np.full((MAX_OPEN_PASSES, 3), np.nan)
         self.front_q = np.full(MAX_OPEN_PASSES, -np.inf)
+        self.open_bits = np.zeros(1, dtype=np.uint8)
 
     def check_room(self, line: StoredLine) -> None:
         """Raise TooManyPasses when the line would open a pass more than MAX_OPEN_PASSES."""
@@ -97,6 +98,7 @@ class PassBook:
         opened = Pass(len(self._passes), self._free.pop(), normal, is_steady=normal is not None)
         self._passes[key] = opened
         self._publish_unknown(opened.slot)
+        self.open_bits |= np.uint8(1 << opened.slot)
         return opened
 
     def publish(self, of: Pass, origin_mm: npt.NDArray[np.float64]) -> None:
@@ -118,6 +120,7 @@ class PassBook:
         slot, closed.slot = closed.slot, -1
         closed.stations.clear()
         self._publish_unknown(slot)
+        self.open_bits &= ~np.uint8(1 << slot)
         self._free.append(slot)
         return Pass(closed.number, slot, closed.normal)
 
