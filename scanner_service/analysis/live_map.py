@@ -214,6 +214,7 @@ class LiveMap:
         side_q = max(math.ceil(side_mm / QUANTUM_MM), SMALLEST_SIDE_Q)
         self._largest_radius_mm = radius_mm
         self._grid = reserve_grid(side_q, self.settings.max_points)
+        self._first_new = 0
         rows, self._grid_rows = self._grid_rows, 0
         if rows:
             self._insert(0, rows)

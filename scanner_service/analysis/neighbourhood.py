@@ -12,7 +12,7 @@ from numba import njit
 
 from scanner_service.analysis.grid import CHUNK, Grid, cell_near, place_in_block
 from scanner_service.analysis.intake import QUANTUM_MM
-from scanner_service.analysis.plane import smallest_axis
+from scanner_service.analysis.plane import fit_planes, smallest_axis
 from scanner_service.analysis.points import GROWTH, GROWTH_REACH, LISTED, MAX_OPEN_PASSES, PointArray
 from scanner_service.analysis.snapshot import Int32Array, UInt8Array, Unreliable
 
@@ -40,6 +40,9 @@ _VECTOR = 16
 
 _FAR = 1e15
 
+_BATCH = 64
+"""So many points are fitted at once."""
+
 
 class Rules(NamedTuple):
     """What makes a normal believed, and how far a radius may grow; the same for the whole map."""
@@ -66,13 +69,13 @@ class Lines(NamedTuple):
     front_q: npt.NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _radius_limit_mm(base_mm, max_radius_mm):
     """r_max of a point whose rule gave `base_mm`."""
     return max(base_mm, min(max_radius_mm, GROWTH_REACH * base_mm))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def evaluate_cells(
     cells: Int32Array,
     grid: Grid,
@@ -95,18 +98,19 @@ def evaluate_cells(
     cell_at, cell_block, cell_count = grid.cell_at, grid.cell_block, grid.cell_count
     cell_first, cell_last = grid.cell_first, grid.cell_last
     block_key, block_near, block_cell, block_needy = grid.block_key, grid.block_near, grid.block_cell, grid.block_needy
-    chunk_next, chunk_xyz, chunk_line = grid.chunk_next, grid.chunk_xyz, grid.chunk_line
-    chunk_point, side_mm = grid.chunk_point, grid.side_q[0] * QUANTUM_MM
-    laser_q, pass_bit, heading, front_q = lines.laser_q, lines.pass_bit, lines.heading, lines.front_q
+    chunk_next, chunk_xyz, chunk_line, chunk_point = grid.chunk_next, grid.chunk_xyz, grid.chunk_line, grid.chunk_point
+    pass_bit, open_bits = lines.pass_bit, np.uint8(lines.open_bits[0])
     is_exact = grid.side_q[0] < _EXACT_SIDE_Q and len(pass_bit) < _EXACT_LINES
-    max_radius_mm = rules.max_radius_mm
-    n_changed = 0
     found = np.empty(27, dtype=np.int64)
-    far = np.empty(729, dtype=np.int64)
     fresh = np.empty((3, 512))
     near = np.empty((4, 512))
-    wide = np.empty((4, 512))
-    open_bits = np.uint8(lines.open_bits[0])
+    rows = np.empty(_BATCH, dtype=np.int64)
+    row_cells = np.empty(_BATCH, dtype=np.int64)
+    row_passes = np.empty(_BATCH, dtype=np.uint8)
+    sums = np.empty((13, _BATCH))
+    fits = np.empty((8, _BATCH))
+    n_batch = 0
+    n_changed = 0
     for i in range(len(cells)):
         cell = np.int64(cells[i])
         n_found, n = _cells_around(cell_at, cell_block, cell_count, block_key, block_near, block_cell, cell, 1, found)
@@ -116,63 +120,146 @@ def evaluate_cells(
         bit = np.uint64(1) << np.uint64(place_in_block(cell_at, cell))
         was_needy = block_needy[cell_block[cell]] & bit != 0
         n_fresh = np.int64(0)
-        if not was_needy:
+        if was_needy:
+            block_needy[cell_block[cell]] &= ~bit
+        elif chunk_point[cell_first[cell], 0] < first_new:  # rows of a cell ascend: its first is its oldest
             n_fresh = _gather_fresh(
                 chunk_next, chunk_xyz, chunk_point, cell_first, cell_last, cell_count, found, n_found, first_new, fresh
             )
         is_gathered = False
-        n_wide = np.int64(-1)
-        needy = False
         chunk = cell_first[cell]
         left = cell_count[cell]
         while left > 0:
             here = min(left, CHUNK)
             for j in range(here):
-                row = chunk_point[chunk, j]
+                row = np.int64(chunk_point[chunk, j])
                 if row < first_new and not was_needy and not _is_reached(points, row, fresh, n_fresh):
                     continue
                 if not is_gathered:
                     _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_found, near)
                     is_gathered = True
-                base_mm = points[row].radius_mm
-                answer = _answer(points, row, near, n, base_mm, is_exact, rules)
-                step = 0
-                if answer[1] != 0:
-                    limit_mm = _radius_limit_mm(base_mm, max_radius_mm)
-                    if limit_mm > base_mm:
-                        needy = True
-                        if n_wide < 0:
-                            rings = min(4, math.ceil(limit_mm / side_mm))
-                            n_far, n_wide = _cells_around(
-                                cell_at, cell_block, cell_count, block_key, block_near, block_cell, cell, rings, far
-                            )
-                            if n_wide + _VECTOR > wide.shape[1]:
-                                wide = np.empty((4, 2 * n_wide + _VECTOR))
-                            _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, far, n_far, wide)
-                        step, grown = _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules)
-                        if step > 0:
-                            answer = grown
+                reach = math.floor((points[row].radius_mm / QUANTUM_MM) ** 2)
+                _put(sums, n_batch, _sums_within(points, row, near, n, reach, is_exact))
                 passes = pass_bit[points[row].line]
                 if open_bits & ~passes:
-                    if step > 0:
-                        reach_mm = min(base_mm * GROWTH**step, limit_mm)
-                        passes = _passes_in_reach(points, row, wide, n_wide, reach_mm, pass_bit)
-                    else:
-                        passes = _passes_in_reach(points, row, near, n, base_mm, pass_bit)
-                passes = _not_gone_by(passes, points, row, heading, front_q, max_radius_mm)
-                if _store(points, row, answer, step, passes, laser_q, version):
-                    changed[n_changed] = row
-                    n_changed += 1
+                    passes = _passes_in_reach(points, row, near, n, reach, pass_bit)
+                rows[n_batch], row_cells[n_batch], row_passes[n_batch] = row, cell, passes
+                n_batch += 1
+                if n_batch == _BATCH:
+                    n_changed = _conclude(
+                        rows, row_cells, row_passes, sums, fits, n_batch,
+                        grid, points, lines, rules, version, is_exact, changed, n_changed,
+                    )  # fmt: skip
+                    n_batch = 0
             left -= here
             chunk = chunk_next[chunk]
-        if needy:
-            block_needy[cell_block[cell]] |= bit
-        elif was_needy:
-            block_needy[cell_block[cell]] &= ~bit
+    return _conclude(
+        rows, row_cells, row_passes, sums, fits, n_batch,
+        grid, points, lines, rules, version, is_exact, changed, n_changed,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _put(sums, column, values):
+    """Write the thirteen sums of a point into a column."""
+    for i in range(13):
+        sums[i, column] = values[i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _conclude(
+    rows, row_cells, row_passes, sums, fits, n, grid, points, lines, rules, version, is_exact, changed, n_changed
+):
+    """Fit a batch of points, let radii grow where that is needed, store the answers; the new number of changed rows."""
+    laser_q, pass_bit, heading, front_q = lines.laser_q, lines.pass_bit, lines.heading, lines.front_q
+    block_needy, cell_block, cell_at = grid.block_needy, grid.cell_block, grid.cell_at
+    max_radius_mm = rules.max_radius_mm
+    wide = np.empty((4, 1))
+    wide_cell, n_wide = np.int64(-1), np.int64(0)
+    fit_planes(sums, n, fits)
+    for i in range(n):
+        row, cell = rows[i], row_cells[i]
+        base_mm = points[row].radius_mm
+        passes = row_passes[i]
+        if fits[6, i] == 0.0:
+            _fit_one(sums, fits, i)
+        reason = _reason_against(sums, fits, i, rules)
+        step = 0
+        radius_mm = base_mm
+        if reason != 0:
+            limit_mm = _radius_limit_mm(base_mm, max_radius_mm)
+            if limit_mm > base_mm:
+                block_needy[cell_block[cell]] |= np.uint64(1) << np.uint64(place_in_block(cell_at, cell))
+                if wide_cell != cell:
+                    wide, n_wide = _gather_wide(grid, cell, limit_mm, wide)
+                    wide_cell = cell
+                step = _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules, sums, fits, i)
+                if step > 0:
+                    reason = 0
+                    radius_mm = min(base_mm * GROWTH**step, limit_mm)
+                    reach = math.floor((radius_mm / QUANTUM_MM) ** 2)
+                    passes = _passes_in_reach(points, row, wide, n_wide, reach, pass_bit)
+        passes = _not_gone_by(passes, points, row, heading, front_q, max_radius_mm)
+        if _store(points, row, sums, fits, i, reason, radius_mm, step, passes, laser_q, version):
+            changed[n_changed] = row
+            n_changed += 1
     return n_changed
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit_one(sums, fits, i):
+    """Fit the plane of one column by the solver that always arrives."""
+    per = 1.0 / max(sums[0, i], 1.0)
+    x, y, z = sums[4, i], sums[5, i], sums[6, i]
+    fits[0, i], fits[1, i], fits[2, i], fits[3, i], fits[4, i], fits[5, i] = smallest_axis(
+        sums[7, i] - x * x * per,
+        sums[8, i] - x * y * per,
+        sums[9, i] - x * z * per,
+        sums[10, i] - y * y * per,
+        sums[11, i] - y * z * per,
+        sums[12, i] - z * z * per,
+    )
+    fits[7, i] = (x * x + y * y + z * z) * per * per
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reason_against(sums, fits, i, rules):
+    """Why the normal of a column is not to be believed, 0 when it is."""
+    total, others, first, second = sums[0, i], sums[1, i], sums[2, i], sums[3, i]
+    if total < MIN_POINTS:
+        return _TOO_FEW
+    # `first` and `second` are the sums of (line - own line) and of its square over the points of other lines: these
+    # are all of one line when the mean is a whole number and the spread is nothing.
+    mean = first / max(others, 1.0)
+    one_other = others > 0.0 and mean == math.floor(mean) and second == first * mean
+    enough_lines = others > 0.0 and (not one_other or (others >= 2.0 and total - others >= 2.0))
+    if rules.needs_lines and not enough_lines:
+        return _SINGLE_LINE
+    # sigma / sqrt(lambda2) <= limit, sigma the larger of the scanner's noise and the residual, all squared
+    to_mm2 = QUANTUM_MM * QUANTUM_MM
+    sigma_sq = max(rules.noise_mm * rules.noise_mm, fits[5, i] * to_mm2 / (total - 3.0))
+    limit_sq = rules.max_error_rad * rules.max_error_rad
+    if not sigma_sq <= limit_sq * fits[4, i] * to_mm2 or fits[4, i] - fits[5, i] < MIN_GAP * fits[3, i]:
+        return _ILL_DETERMINED
+    return 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gather_wide(grid, cell, limit_mm, wide):
+    """All points as far as a radius may grow: the buffer, a larger one if need be, and how many it holds."""
+    rings = min(4, math.ceil(limit_mm / (grid.side_q[0] * QUANTUM_MM)))
+    found = np.empty(729, dtype=np.int64)
+    n_found, n = _cells_around(
+        grid.cell_at, grid.cell_block, grid.cell_count, grid.block_key, grid.block_near, grid.block_cell,
+        cell, rings, found,
+    )  # fmt: skip
+    if n + _VECTOR > wide.shape[1]:
+        wide = np.empty((4, 2 * n + _VECTOR))
+    _gather(grid.chunk_next, grid.chunk_xyz, grid.chunk_line, grid.cell_first, grid.cell_count, found, n_found, wide)
+    return wide, n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _gather_fresh(
     chunk_next, chunk_xyz, chunk_point, cell_first, cell_last, cell_count, found, n_found, first_new, fresh
 ):
@@ -197,7 +284,7 @@ def _gather_fresh(
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _is_reached(points, row, fresh, n_fresh):
     """True when a new point lies within the radius of a point."""
     x, y, z = float(points[row].x), float(points[row].y), float(points[row].z)
@@ -209,7 +296,7 @@ def _is_reached(points, row, fresh, n_fresh):
     return reached
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cells_around(cell_at, cell_block, cell_count, block_key, block_near, block_cell, cell, rings, found):
     """Put the cells up to `rings` away into `found`; returns how many, and how many points they hold."""
     n_found = 0
@@ -225,7 +312,7 @@ def _cells_around(cell_at, cell_block, cell_count, block_key, block_near, block_
     return n_found, n_points
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_found, buffer):
     """Copy x, y, z and line of every point in the cells found, and pad."""
     n = 0
@@ -247,67 +334,40 @@ def _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_
         buffer[1, n + j], buffer[2, n + j], buffer[3, n + j] = 0.0, 0.0, 0.0
 
 
-@njit(cache=True, nogil=True)
-def _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules):
-    """The first step at which the grown radius makes the point reliable, with its answer; step 0 when none does."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules, sums, fits, i):
+    """Grow the radius to the first step that makes the point reliable, leaving its sums and fit in column i.
+
+    Returns the step; 0 when none does, and the column is as it was.
+    """
+    kept_sums, kept_fits = sums[:, i].copy(), fits[:, i].copy()
     step = 0
     radius_mm = base_mm
-    answer = _answer(points, row, wide, 0, base_mm, is_exact, rules)
     while radius_mm < limit_mm:
         step += 1
         radius_mm = min(base_mm * GROWTH**step, limit_mm)
-        answer = _answer(points, row, wide, n_wide, radius_mm, is_exact, rules)
-        if answer[1] == 0:
-            return step, answer
-    return 0, answer
+        reach = math.floor((radius_mm / QUANTUM_MM) ** 2)
+        _put(sums, i, _sums_within(points, row, wide, n_wide, reach, is_exact))
+        _fit_one(sums, fits, i)
+        if _reason_against(sums, fits, i, rules) == 0:
+            return step
+    sums[:, i] = kept_sums
+    fits[:, i] = kept_fits
+    return 0
 
 
-@njit(cache=True, nogil=True)
-def _answer(points, row, local, n, radius_mm, is_exact, rules):
-    """(Np, reason, nx, ny, nz, lambda2 mm2, lambda3 mm2, offset^2) of a point with this radius."""
-    reach = math.floor((radius_mm / QUANTUM_MM) ** 2)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sums_within(points, row, local, n, reach, is_exact):
+    """The sums of `_sums`, exact for any radius."""
     px, py, pz, own = points[row].x, points[row].y, points[row].z, points[row].line
     if is_exact:
         sums = _sums(local, n, float(px), float(py), float(pz), float(own), float(reach))
-        is_exact = sums[0] * reach < _EXACT
-    if not is_exact:
-        sums = _sums_of_integers(local, n, px, py, pz, own, reach)
-    total, others, first, second, fx, fy, fz, sxx, sxy, sxz, syy, syz, szz = sums
-    count = int(total)
-    per = 1.0 / max(total, 1.0)
-    # Np times the central moments, from exact sums: no digits are lost far from the origin.
-    ax, ay, az, l1, l2, l3 = smallest_axis(
-        sxx - fx * fx * per,
-        sxy - fx * fy * per,
-        sxz - fx * fz * per,
-        syy - fy * fy * per,
-        syz - fy * fz * per,
-        szz - fz * fz * per,
-    )
-    to_mm2 = QUANTUM_MM * QUANTUM_MM
-    l2_mm2, l3_mm2 = l2 * to_mm2, l3 * to_mm2
-    # `first` and `second` are the sums of (line - own line) and of its square over the points of other lines: these
-    # are all of one line when the mean is a whole number and the spread is nothing.
-    mean = first / max(others, 1.0)
-    one_other = others > 0.0 and mean == math.floor(mean) and second == first * mean
-    enough_lines = others > 0.0 and (not one_other or (others >= 2.0 and total - others >= 2.0))
-    reason = 0
-    if count < MIN_POINTS:
-        reason = _TOO_FEW
-    elif rules.needs_lines and not enough_lines:
-        reason = _SINGLE_LINE
-    else:
-        # sigma / sqrt(lambda2) <= limit, sigma the larger of the scanner's noise and the residual, all squared
-        sigma_sq = max(rules.noise_mm * rules.noise_mm, l3_mm2 / (total - 3.0))
-        limit_sq = rules.max_error_rad * rules.max_error_rad
-        if not sigma_sq <= limit_sq * l2_mm2 or l2 - l3 < MIN_GAP * l1:
-            reason = _ILL_DETERMINED
-    radius_q = radius_mm / QUANTUM_MM
-    offset = (fx * fx + fy * fy + fz * fz) * per * per / (radius_q * radius_q)
-    return count, reason, ax, ay, az, l2_mm2, l3_mm2, offset
+        if sums[0] * reach < _EXACT:
+            return sums
+    return _sums_of_integers(local, n, px, py, pz, own, reach)
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc", "nsz", "nnan", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "nnan", "contract"})
 def _sums(local, n, px, py, pz, own, reach):
     """Counts and moments of the candidates within reach, without a branch, for vector registers.
 
@@ -338,7 +398,7 @@ def _sums(local, n, px, py, pz, own, reach):
     return count, others, first, second, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sums_of_integers(local, n, px, py, pz, own, reach):
     """The same as `_sums` for any radius and any number of lines, in 64-bit integers; the lines' sums are 0, 1 or 2."""
     count, others = np.int64(0), np.int64(0)
@@ -382,42 +442,44 @@ def _sums_of_integers(local, n, px, py, pz, own, reach):
     )
 
 
-@njit(cache=True, nogil=True)
-def _store(points, row, answer, step, passes, laser_q, version):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _store(points, row, sums, fits, i, reason, radius_mm, step, passes, laser_q, version):
     """Write an answer into the point's record; True when it differs from the one before."""
-    count, reason, ax, ay, az, l2_mm2, l3_mm2, offset = answer
-    point = points[row]
+    count = np.int32(sums[0, i])
+    ax, ay, az = fits[0, i], fits[1, i], fits[2, i]
     if reason:
         ax, ay, az = math.nan, math.nan, math.nan
     else:
-        at = point.line
-        to_x, to_y = laser_q[at, 0] - point.x, laser_q[at, 1] - point.y
-        if ax * to_x + ay * to_y + az * (laser_q[at, 2] - point.z) < 0.0:  # Eq. 6.11
+        at = points[row].line
+        to_x, to_y = laser_q[at, 0] - points[row].x, laser_q[at, 1] - points[row].y
+        if ax * to_x + ay * to_y + az * (laser_q[at, 2] - points[row].z) < 0.0:  # Eq. 6.11
             ax, ay, az = -ax, -ay, -az
     nx, ny, nz = np.float32(ax), np.float32(ay), np.float32(az)
-    waiting = point.open_passes & np.uint8(LISTED)
+    listed = points[row].open_passes & np.uint8(LISTED)
     same = (
-        point.neighbours == count
-        and point.unreliable == reason
-        and point.growth == step
-        and point.open_passes & ~np.uint8(LISTED) == passes
-        and (reason != 0 or (point.nx == nx and point.ny == ny and point.nz == nz))
+        points[row].changed_at > 0
+        and points[row].neighbours == count
+        and points[row].unreliable == reason
+        and points[row].growth == step
+        and points[row].open_passes == passes | listed
+        and (reason != 0 or (points[row].nx == nx and points[row].ny == ny and points[row].nz == nz))
     )
-    if same and point.changed_at > 0:
+    if same:
         return False
-    point.neighbours = count
-    point.unreliable = reason
-    point.growth = step
-    point.open_passes = passes | waiting
-    point.nx, point.ny, point.nz = nx, ny, nz
-    point.middle_mm2 = l2_mm2
-    point.smallest_mm2 = l3_mm2
-    point.offset_sq = offset
-    point.changed_at = version
+    to_mm2 = QUANTUM_MM * QUANTUM_MM
+    points[row].neighbours = count
+    points[row].unreliable = reason
+    points[row].growth = step
+    points[row].open_passes = passes | listed
+    points[row].nx, points[row].ny, points[row].nz = nx, ny, nz
+    points[row].middle_mm2 = fits[4, i] * to_mm2
+    points[row].smallest_mm2 = fits[5, i] * to_mm2
+    points[row].offset_sq = fits[7, i] * to_mm2 / (radius_mm * radius_mm)
+    points[row].changed_at = version
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _not_gone_by(bits, points, row, heading, front_q, max_radius_mm):
     """Of the passes in `bits`, those whose laser plane is not yet more than the point's r_max beyond it."""
     if bits == 0:
@@ -432,12 +494,11 @@ def _not_gone_by(bits, points, row, heading, front_q, max_radius_mm):
     return bits
 
 
-@njit(cache=True, nogil=True)
-def _passes_in_reach(points, row, local, n, radius_mm, pass_bit):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _passes_in_reach(points, row, local, n, reach, pass_bit):
     """The bits of all open passes that have a point within reach."""
     px, py, pz = np.int64(points[row].x), np.int64(points[row].y), np.int64(points[row].z)
     bits = pass_bit[points[row].line]
-    reach = np.int64(math.floor((radius_mm / QUANTUM_MM) ** 2))
     for k in range(n):
         bit = pass_bit[np.int64(local[3, k])]
         if bit & ~bits:
@@ -447,7 +508,7 @@ def _passes_in_reach(points, row, local, n, radius_mm, pass_bit):
     return bits
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def settle_listed(
     listed: Int32Array, points: PointArray, lines: Lines, rules: Rules, version: int, settled: Int32Array
 ) -> tuple[int, int]:
@@ -475,7 +536,7 @@ def settle_listed(
     return waiting, done
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def list_unsettled(rows: Int32Array, points: PointArray, listed: Int32Array, used: int) -> int:
     """Append to `listed` the rows that wait for a pass and are not listed yet; returns the new length."""
     for row in rows:
@@ -487,7 +548,7 @@ def list_unsettled(rows: Int32Array, points: PointArray, listed: Int32Array, use
     return used
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def drop_pass(listed: Int32Array, points: PointArray, bit: int) -> None:
     """Forget a closed pass at every listed row."""
     for row in listed:
