@@ -213,7 +213,11 @@ class StandIn:
 
     def status(self, end: int, total: int) -> dict[str, Any]:
         """What the service says twice a second."""
-        losses = {"points": {"dropout": 214, "missing": 64, "not_finite": 0}, "chunks": {"damaged": 3, "duplicate": 1}}
+        dropped = {"dropout": 214, "missing": 64}
+        points = {"places": end + 278, "counted": end, "dropped": dropped, "left_out": {}}
+        received = end // self.cloud.per_line
+        lines = {"received": received, "pending": 0, "stored": received - 2, "duplicates": 0, "conflicts": 0}
+        losses = {"points": points, "lines": lines | {"refused": {"invalid": 2}}, "device": None}
         return {
             "type": "status",
             "state": self.state,
@@ -331,9 +335,11 @@ def test_the_newest_live_session_opens_by_itself_and_every_point_arrives_without
     assert page.tab.text_content("#session-state") == "scanning"
     assert page.tab.text_content("#connection-text") == "Live"
     page.until("document.querySelector('#figures').textContent.includes('93.4')")
-    assert re.sub(r"\s", "", page.tab.text_content("#losses")).startswith(
-        "Points278Dropout214Missing64Notfinite0Chunks4"
-    )
+    page.until("document.querySelector('#losses-count').textContent === '2 scanlines, 64 points lost'")
+    page.tab.click("#losses-fold summary")
+    told = re.sub(r"\s+", " ", page.tab.inner_text("#losses"))
+    assert re.search(r"No return \S+ % 214 In a piece that never arrived \S+ % 64 Scanlines", told), told
+    assert re.search(r"Refused: invalid \S+ % 2 None: on the way to the record, duplicates, conflicts", told), told
     assert [page.tab.text_content(f"#regions li:nth-child({i}) .reason") for i in (1, 2)] == ["Sparse", "Steep"]
     assert complaints_of(page) == []
     assert host.service.overdrawn == 0
@@ -386,14 +392,16 @@ def test_keys_choose_front_right_and_top_views_and_fit(page: Page, host: Host) -
         settle(page)
         arm = np.array(page.number("eye")) - np.array(page.number("target"))
         assert sign * arm[axis] > 0.999 * np.linalg.norm(arm)
-    for _ in range(5):
-        page.tab.keyboard.press("+")
-        settle(page)
+    page.tab.keyboard.press("+")
+    page.tab.keyboard.press("-")
+    page.tab.keyboard.press("+")
+    page.tab.keyboard.press("+")
+    settle(page)
     near = np.linalg.norm(np.array(page.number("eye")) - np.array(page.number("target")))
     page.tab.keyboard.press("f")
     settle(page)
     far = np.linalg.norm(np.array(page.number("eye")) - np.array(page.number("target")))
-    assert far > 2 * near
+    assert far > 1.5 * near  # the steps add up, however fast they follow each other
 
 
 def test_a_click_tells_coordinates_in_the_part_frame_that_lie_on_the_surface(page: Page, host: Host) -> None:
@@ -444,11 +452,12 @@ def test_blue_is_dense_red_is_sparse_and_grey_is_unreliable(page: Page, host: Ho
 
 def colour_at(page: Page, x: float, y: float) -> tuple[int, ...]:
     """The commonest bright colour around a place of the surface, seen from the top: the page's own screenshot tells."""
+    middle = page.number("middle")
     frame = page.tab.locator("#canvas").bounding_box()
     eye, target = np.array(page.number("eye")), np.array(page.number("target"))
     px_per_mm = frame["height"] / (2 * (eye[2] - height_mm(x, y)) * np.tan(np.radians(16)))
-    cx = frame["x"] + frame["width"] / 2 + (x - target[0]) * px_per_mm
-    cy = frame["y"] + frame["height"] / 2 - (y - target[1]) * px_per_mm
+    cx = frame["x"] + middle[0] + (x - target[0]) * px_per_mm
+    cy = frame["y"] + middle[1] - (y - target[1]) * px_per_mm
     clip = {"x": cx - 10, "y": cy - 10, "width": 20, "height": 20}
     pixels = (imread(io.BytesIO(page.tab.screenshot(clip=clip)), format="png")[..., :3] * 255).round().astype(int)
     bright = pixels.reshape(-1, 3)

@@ -10,7 +10,7 @@ const BINS = 59;
 const UNRELIABLE = ["#78797f", "no reliable normal"];
 const UNSETTLED = ["#4d5966", "darker: not settled yet"];
 
-// {rule, scale, range: [low, high], sample: sorted values, required: number | null}
+// {rule, scale, range: [low, high], sample: sorted values, required: [least, most] | null}
 export function drawLegend(place, { rule, scale, range, sample, required }) {
   place.hidden = false;
   if (rule === "rescan") place.replaceChildren(title("Rescan reason"), reasonList());
@@ -64,9 +64,10 @@ function scaleParts(rule, scale, [low, high], sample, required) {
     picture.append(svg("line", { x1: x(value), x2: x(value), y1: 42, y2: 46, class: "tick" }), svg("text", { x: x(value), y: 58, "text-anchor": "middle" }, significant(value)));
   }
   const notes = [];
-  if (density && required !== null && required > low && required < high) {
-    picture.append(svg("path", { d: `M${x(required)} 2V47`, class: "required" }));
-    notes.push(element("p.note", {}, element("b", {}, "┆"), ` required ${significant(required)} points/mm²`));
+  if (density && required !== null) {
+    const ends = [...new Set(required.map((value) => significant(value)))];
+    picture.append(svg("path", { d: required.filter((value) => value > low && value < high).map((value) => `M${x(value)} 2V47`).join(""), class: "required" }));
+    notes.push(element("p.note", {}, element("b", {}, "┆"), ` required ${ends.join(" – ")} points/mm²`));
   }
   return [title(density ? "Density" : "Height", density ? "points/mm²" : "mm"), picture, ...notes, element("ul.keys-list", {}, key(...UNRELIABLE), key(...UNSETTLED))];
 }

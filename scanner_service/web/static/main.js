@@ -39,7 +39,7 @@ const picker = new SessionPicker({ onChoose: openSession, onMissing: (text) => n
 
 function openView() {
   try {
-    return new SceneView(byId("canvas"), { beforeDraw, afterDraw });
+    return new SceneView(byId("canvas"), { beforeDraw, afterDraw, freeAreas });
   } catch (error) {
     notice("This browser shows no WebGL 2, which the point cloud needs. Figures, regions and exports still work elsewhere.");
     throw error;
@@ -49,8 +49,16 @@ function openView() {
 // --- what arrives ---------------------------------------------------------------------------------------------------
 
 function points() {
-  notice("");
+  explainEmptiness();
   view.invalidate();
+}
+
+function explainEmptiness() {
+  const state = session.status?.state;
+  if (session.store.end > 0) notice("");
+  else if (session.startable) notice("Not scanning. Start begins the scan.");
+  else if (OVER.has(state)) notice("No point was scanned in this session.");
+  else notice("Waiting for the first points…");
 }
 
 function status() {
@@ -60,11 +68,14 @@ function status() {
   state.textContent = words(told.state);
   state.dataset.state = told.state;
   byId("stop").hidden = OVER.has(told.state) || told.state === "created";
-  byId("start").hidden = told.state !== "created";
+  byId("start").hidden = !session.startable;
+  byId("start").textContent = told.state === "created" ? "Start" : "Go on";
   byId("stop-note").hidden = byId("stop").hidden;
+  explainEmptiness();
   const progress = byId("progress");
   progress.hidden = told.progress === null || told.progress === undefined;
   if (!progress.hidden) progress.value = told.progress;
+  progress.dataset.state = told.state;
   say();
   drawFigures(byId("figures"), told, session.store, session.box);
   drawLosses(byId("losses"), byId("losses-count"), told.losses);
@@ -94,7 +105,7 @@ function connection({ state, seconds, attempt, reason }) {
   byId("connection-text").textContent = texts[state] ?? state;
   byId("connection").title = reason || "";
   byId("retry").hidden = state !== "waiting";
-  byId("view").classList.toggle("stale", state === "waiting" || state === "connecting" || state === "quiet");
+  document.body.classList.toggle("stale", state === "waiting" || state === "connecting" || state === "quiet");
   if (state === "open") trouble("");
   if (state === "absent") notice(reason || "There is no such session.");
   if (state === "waiting") listSessions().catch((refusal) => trouble(refusal.message)); // it may say why
@@ -107,6 +118,18 @@ function trouble(text) {
 }
 
 // --- the picture ----------------------------------------------------------------------------------------------------
+
+// The picture's parts that no control and no legend lies on: all of it, or what is left beside or above the legend.
+function freeAreas(width, height) {
+  const tools = document.querySelector(".tools");
+  const whole = { left: 28, top: tools.offsetTop + tools.offsetHeight + 22, right: width - 28, bottom: height - 28 };
+  const card = byId("legend");
+  if (card.hidden) return [whole];
+  const beside = { ...whole, left: card.offsetLeft + card.offsetWidth + 20 };
+  const above = { ...whole, bottom: card.offsetTop - 14 };
+  const areas = [beside, above].filter(({ left, top, right, bottom }) => right - left > 0.4 * width && bottom - top > 0.4 * height);
+  return areas.length ? areas : [whole];
+}
 
 function beforeDraw() {
   cloud.upload();
@@ -127,9 +150,9 @@ function afterDraw() {
 
 function survey() {
   if (!session.survey()) return;
-  if (session.box) view.setBox(session.box);
   if (look.autoRange) look.range = session.densityRange(look.range);
   applyLook();
+  if (session.box) view.setBox(session.box); // behind the legend's drawing: its size says where there is room
   drawFigures(byId("figures"), session.status, session.store, session.box);
   inspect(inspectedRow);
 }
@@ -164,8 +187,8 @@ function openSession(chosen) {
   trouble("");
   view.touched = false;
   look.range = look.autoRange ? [0, 1] : look.range;
-  notice("Waiting for the first points…");
   session.open(chosen.id);
+  explainEmptiness();
   overlay.show([], session.origin, view.radius);
   drawFigures(byId("figures"), null, session.store, null);
   drawLosses(byId("losses"), byId("losses-count"), null);
@@ -183,13 +206,10 @@ function chooseRegion(number) {
   overlay.choose(number);
   drawRegions(byId("regions"), byId("regions-count"), session.regions, chosenRegion, chooseRegion);
   byId("regions").querySelector("[aria-pressed=true]")?.scrollIntoView({ block: "nearest" });
-  view.focus(region.centroid_mm.map((value, axis) => value - session.origin[axis]), { sizeMm: extentMm(region), normal: region.normal });
-}
-
-function extentMm(region) {
-  const corners = (region.outline_mm ?? []).flat();
-  const reach = corners.map((corner) => Math.hypot(...corner.map((value, axis) => value - region.centroid_mm[axis])));
-  return reach.length ? 2 * Math.max(...reach) : 2 * Math.sqrt(region.area_mm2);
+  const local = (point) => point.map((value, axis) => value - session.origin[axis]);
+  const corners = [region.centroid_mm, ...(region.outline_mm ?? []).flat()].map(local);
+  const ends = (end) => [0, 1, 2].map((axis) => end(...corners.map((corner) => corner[axis])));
+  view.inspect(local(region.centroid_mm), { low: ends(Math.min), high: ends(Math.max) }, region.normal);
 }
 
 function inspect(row) {
@@ -211,9 +231,12 @@ function rowUnder(event) {
 }
 
 function say() {
-  const text = (performance.now() < troubled.until && troubled.text) || session.status?.message || "";
-  byId("message").hidden = !text;
-  if (byId("message").textContent !== text) byId("message").textContent = text;
+  const trouble = performance.now() < troubled.until && troubled.text;
+  const text = trouble || session.status?.message || "";
+  const place = byId("message");
+  place.hidden = !text;
+  place.dataset.kind = trouble ? "trouble" : (session.status?.state ?? "");
+  if (place.textContent !== text) place.textContent = text;
 }
 
 function notice(text) {
@@ -291,8 +314,9 @@ function listen() {
   byId("stop").addEventListener("click", (event) => command(event.currentTarget, stopSession));
   byId("retry").addEventListener("click", () => session.retryNow());
   addEventListener("online", () => session.retryNow());
+  document.addEventListener("visibilitychange", () => document.hidden || session.retryNow()); // such as after signing in elsewhere
   document.addEventListener("pointerdown", (event) => {
-    for (const menu of document.querySelectorAll("details[open]")) if (!menu.contains(event.target)) menu.open = false;
+    for (const menu of document.querySelectorAll("details.menu[open]")) if (!menu.contains(event.target)) menu.open = false;
   });
   listenToKeys(view, { openSessions: () => picker.show(), clear });
   setInterval(survey, SURVEY_MS);
@@ -313,6 +337,7 @@ globalThis.viewer = Object.freeze({
   get frames() { return frames; },
   get inspected() { return inspectedRow; },
   get densityRange() { return [...look.range]; },
+  get middle() { return view.middle; },
   get target() { return view.controls.target.toArray(); },
   get eye() { return view.camera.position.toArray(); },
 });

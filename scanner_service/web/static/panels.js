@@ -2,6 +2,7 @@
 
 import { element } from "./element.js";
 import { lineSample } from "./legend.js";
+import { accounts, headline } from "./loss_ledger.js";
 import { fixed, missing, percent, plural, sentence, significant, whole, words } from "./numbers.js";
 import { reasonByKey, RESCAN_REASONS, rescanReason, STATE_ISOLATED, STATE_NOT_COUNTED, STATE_RELIABLE, STATE_RESCAN, STATE_SETTLED, UNRELIABLE_REASONS, unreliableReason } from "./stream_format.js";
 
@@ -19,21 +20,22 @@ export function drawFigures(place, status, store, box) {
   );
 }
 
-// Sum of all numbers in a nested tally.
-export const tallyTotal = (tally) => (typeof tally === "number" ? tally : Object.values(tally ?? {}).reduce((sum, part) => sum + tallyTotal(part), 0));
-
 export function drawLosses(place, count, losses) {
-  const groups = Object.entries(losses ?? {}).filter(([, value]) => typeof value === "object" && value !== null);
-  const single = Object.entries(losses ?? {}).filter(([, value]) => typeof value === "number");
-  const total = tallyTotal(losses);
-  count.textContent = losses ? (total > 0 ? "" : "none") : "";
-  const rows = (entries) => element("dl.tally", {}, ...entries.flatMap(([name, value]) => [element(value > 0 ? "dt" : "dt.zero", {}, sentence(name)), element(value > 0 ? "dd" : "dd.zero", {}, whole(value))]));
-  const flat = (tally, prefix = "") => Object.entries(tally).flatMap(([name, value]) => (typeof value === "number" ? [[prefix + name, value]] : flat(value ?? {}, `${prefix}${name}: `)));
-  place.replaceChildren(
-    single.length ? rows(single) : "",
-    ...groups.map(([name, tally]) => element("section.tally-group", {}, element("h3", {}, sentence(name), element("span.unit", {}, whole(tallyTotal(tally)))), rows(flat(tally)))),
-    total === 0 && !groups.length && !single.length ? element("p.empty", {}, losses ? "Nothing was lost." : "Not known yet.") : "",
-  );
+  count.textContent = headline(losses);
+  count.classList.toggle("lost", count.textContent.endsWith(" lost") && !count.textContent.startsWith("nothing"));
+  const tally = ({ title, unit, total, rows }) => {
+    const share = (value) => (total > 0 && value > 0 ? element("span.unit", {}, percent(value / total)) : null);
+    const some = rows.filter(([, value, kind]) => value > 0 || kind === "kept");
+    const none = rows.filter((entry) => !some.includes(entry)).map(([name]) => name.toLowerCase());
+    return element(
+      "section.tally-group",
+      {},
+      element("h3", {}, title, total === null ? null : element("span", {}, whole(total), element("span.unit", {}, unit))),
+      element("dl.tally", {}, ...some.flatMap(([name, value, kind]) => [element(`dt.${kind}`, {}, name), element(`dd.${kind}`, {}, share(value), " ", whole(value))])),
+      none.length ? element("p.none", {}, `None: ${none.join(", ")}`) : null,
+    );
+  };
+  place.replaceChildren(...(losses ? accounts(losses).map(tally) : [element("p.empty", {}, "Not known yet.")]));
 }
 
 export function drawRegions(place, count, regions, chosen, onChoose) {
@@ -42,12 +44,12 @@ export function drawRegions(place, count, regions, chosen, onChoose) {
     place.replaceChildren(element("li.empty", {}, regions === null ? "Not known yet." : "No region needs another scan."));
     return;
   }
-  const item = (region) => {
+  const item = (region, said) => {
     const reason = reasonByKey(region.reason);
     const share = region.required_per_mm2 > 0 ? Math.min(1, region.measured_per_mm2 / region.required_per_mm2) : 0;
     return element(
       "li",
-      {},
+      { "data-said": said },
       element(
         "button.region",
         { type: "button", "aria-pressed": String(region.number === chosen), onclick: () => onChoose(region.number), title: region.remedy ? `Remedy: ${region.remedy}` : null },
@@ -61,9 +63,13 @@ export function drawRegions(place, count, regions, chosen, onChoose) {
       ),
     );
   };
+  // an entry that says the same stays the same element: a click that is under way while the list is renewed still counts
+  const said = (region) => JSON.stringify([region.number === chosen, { ...region, outline_mm: null, centroid_mm: null, normal: null }]);
+  const old = new Map([...place.children].map((entry) => [entry.dataset.said, entry]));
   const focused = place.contains(document.activeElement) ? [...place.querySelectorAll("button")].indexOf(document.activeElement) : -1;
   const scrolled = place.scrollTop;
-  place.replaceChildren(...regions.map(item));
+  const entries = regions.map((region) => old.get(said(region)) ?? item(region, said(region)));
+  if (entries.length !== place.children.length || entries.some((entry, i) => entry !== place.children[i])) place.replaceChildren(...entries);
   place.scrollTop = scrolled;
   if (focused >= 0) place.querySelectorAll("button")[Math.min(focused, regions.length - 1)].focus();
 }

@@ -4,6 +4,7 @@ import { Color, GreaterDepth, Group, Vector2, Vector3 } from "three";
 import { LineMaterial } from "./vendor/three/addons/lines/LineMaterial.js";
 import { LineSegments2 } from "./vendor/three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "./vendor/three/addons/lines/LineSegmentsGeometry.js";
+import { roomFor } from "./label_places.js";
 import { reasonByKey } from "./stream_format.js";
 
 export class RegionOverlay {
@@ -29,16 +30,20 @@ export class RegionOverlay {
       line.material.dispose();
     }
     this.group.clear();
+    this.kept = new Map(this.items.map((item) => [item.region.number, item.label]));
     this.items = regions.map((region) => this.#build(region, origin, sizeMm));
-    this.labels.replaceChildren(...this.items.map((item) => item.label));
+    const labels = this.items.map((item) => item.label);
+    if (labels.length !== this.labels.children.length || labels.some((label, i) => label !== this.labels.children[i])) this.labels.replaceChildren(...labels);
   }
 
   choose(number) {
     for (const item of this.items) {
       const chosen = item.region.number === number;
+      item.chosen = chosen;
       item.label.classList.toggle("chosen", chosen);
-      item.front.material.linewidth = chosen ? 4 : 2.5;
-      item.halo.material.linewidth = chosen ? 8 : 5;
+      const width = chosen ? 4 : 1.5 + Math.min(1, item.region.priority ?? 0); // the urgent ones stand out
+      item.front.material.linewidth = width;
+      item.halo.material.linewidth = 2 * width;
     }
   }
 
@@ -68,14 +73,19 @@ export class RegionOverlay {
       made.renderOrder = order + 1;
     });
     front.computeLineDistances();
+    const label = this.kept.get(region.number) ?? this.#label(region.number);
+    label.title = `Region ${region.number}: ${reason.text}`;
+    return { region, reason, behind, halo, front, label, chosen: false, centre: region.centroid_mm.map((value, axis) => value - origin[axis]), normal };
+  }
+
+  #label(number) {
     const label = document.createElement("button");
     label.type = "button";
     label.className = "region-label";
-    label.textContent = String(region.number);
-    label.title = `Region ${region.number}: ${reason.text}`;
+    label.textContent = String(number);
     label.tabIndex = -1; // the list holds the same actions for the keyboard
-    label.addEventListener("click", () => this.onChoose(region.number));
-    return { region, reason, behind, halo, front, label, centre: region.centroid_mm.map((value, axis) => value - origin[axis]), normal };
+    label.addEventListener("click", () => this.onChoose(number));
+    return label;
   }
 
   // Dashes and labels have a size on the screen, so they follow the camera.
@@ -84,7 +94,9 @@ export class RegionOverlay {
     const resolution = new Vector2(view.width, view.height);
     const mmPerPixel = 1 / view.pixelsPerMm;
     const eye = view.camera.position;
-    for (const { front, halo, behind, reason, label, centre, normal } of this.items) {
+    const seen = [];
+    for (const item of this.items) {
+      const { front, halo, behind, reason, label, centre, normal } = item;
       for (const line of [front, halo, behind]) line.material.resolution.copy(resolution);
       if (reason.dash.length) {
         front.material.dashSize = reason.dash[0] * mmPerPixel;
@@ -93,9 +105,14 @@ export class RegionOverlay {
       const at = view.project(centre);
       const inside = at.visible && at.x > -20 && at.y > -20 && at.x < view.width + 20 && at.y < view.height + 20;
       label.hidden = !inside;
+      if (!inside) continue;
       label.style.transform = `translate(${at.x.toFixed(1)}px, ${at.y.toFixed(1)}px) translate(-50%, -50%)`;
       const facing = normal.x * (eye.x - centre[0]) + normal.y * (eye.y - centre[1]) + normal.z * (eye.z - centre[2]) > 0;
       label.classList.toggle("behind", !facing);
+      seen.push({ x: at.x, y: at.y, text: label.textContent, label, importance: (item.chosen ? 2 : 0) + (facing ? 1 : 0) });
     }
+    // the list is in order of urgency, and sorting keeps that order among equals
+    const whole = roomFor(seen.sort((a, b) => b.importance - a.importance));
+    for (const place of seen) place.label.classList.toggle("dot", !whole.has(place));
   }
 }

@@ -1,6 +1,7 @@
 // The camera, its controls and when to draw; knows a box to look at, but neither points nor regions.
 
 import { Color, MOUSE, PerspectiveCamera, Scene, Vector3, WebGLRenderer } from "three";
+import { fitInto } from "./fitting.js";
 import { OrbitControls } from "./vendor/three/addons/controls/OrbitControls.js";
 
 const FIELD_OF_VIEW_DEG = 32;
@@ -14,8 +15,9 @@ export const VIEWS = {
 };
 
 export class SceneView {
-  // beforeDraw and afterDraw run around each drawn picture; nothing is drawn until something asks for it.
-  constructor(canvas, { beforeDraw, afterDraw }) {
+  // beforeDraw and afterDraw run around each drawn picture; nothing is drawn until something asks for it. freeAreas(width,
+  // height) tells the parts of the picture that nothing lies on, {left, top, right, bottom} in pixels, to choose from.
+  constructor(canvas, { beforeDraw, afterDraw, freeAreas }) {
     this.canvas = canvas;
     this.renderer = new WebGLRenderer({ canvas, antialias: true, powerPreference: "high-performance" });
     this.renderer.setPixelRatio(Math.min(globalThis.devicePixelRatio || 1, 2));
@@ -36,6 +38,8 @@ export class SceneView {
     this.box = { low: [-50, -50, -10], high: [50, 50, 10] };
     this.beforeDraw = beforeDraw;
     this.afterDraw = afterDraw;
+    this.freeAreas = freeAreas;
+    this.shift = [0, 0]; // of the point the camera turns about, beside the middle of the picture, px
     this.flight = null;
     this.asked = false;
     this.width = this.height = 1;
@@ -57,7 +61,16 @@ export class SceneView {
   // Pixels (CSS) that one millimetre covers at the point the camera turns about.
   get pixelsPerMm() {
     const distance = this.camera.position.distanceTo(this.controls.target);
-    return this.height / (2 * distance * Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360));
+    return this.#focalPx / distance;
+  }
+
+  get #focalPx() {
+    return this.height / (2 * Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360));
+  }
+
+  // The pixel of the point that the camera turns about.
+  get middle() {
+    return [0.5 * this.width + this.shift[0], 0.5 * this.height + this.shift[1]];
   }
 
   invalidate() {
@@ -76,27 +89,32 @@ export class SceneView {
   // Everything in view, seen from where the camera is.
   fit({ fly = true } = {}) {
     const direction = this.camera.position.clone().sub(this.controls.target).normalize();
-    this.#travel(this.centre, direction.multiplyScalar(this.#fittingDistance(direction)), fly);
+    this.#travelTo(this.centre, direction, this.#fitting(direction, this.centre, this.box), fly);
   }
 
   look(name, { fly = true } = {}) {
     const direction = new Vector3(...VIEWS[name]).normalize();
     this.touched = true;
-    this.#travel(this.centre, direction.multiplyScalar(this.#fittingDistance(direction)), fly);
+    this.#travelTo(this.centre, direction, this.#fitting(direction, this.centre, this.box), fly);
   }
 
-  // Turn about `point` from now on; with a size, come near enough for that many millimetres to fill a third of the view.
-  focus(point, { sizeMm = null, normal = null } = {}) {
+  // Turn about `point` from now on, from as far as before.
+  focus(point) {
     this.touched = true;
-    const arm = this.camera.position.clone().sub(this.controls.target);
-    let distance = arm.length();
-    if (sizeMm !== null) distance = Math.max(3 * sizeMm, 0.12 * this.radius) / (2 * Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360));
-    let direction = arm.normalize();
-    if (normal) {
-      const outward = new Vector3(...normal).normalize();
-      direction = outward.addScaledVector(direction, 0.45).addScaledVector(new Vector3(0, -0.25, 0.25), 1).normalize();
-    }
-    this.#travel(new Vector3(...point), direction.multiplyScalar(distance));
+    this.#travel(new Vector3(...point), this.camera.position.clone().sub(this.controls.target), this.shift);
+  }
+
+  // Turn about `point` and see the box around it, with something of what lies about it, from the side of its normal.
+  inspect(point, box, normal) {
+    this.touched = true;
+    const centre = new Vector3(...point);
+    const direction = this.camera.position.clone().sub(this.controls.target).normalize();
+    if (normal) direction.multiplyScalar(0.45).add(new Vector3(...normal).normalize()).add(new Vector3(0, -0.25, 0.25)).normalize();
+    const least = 0.1 * this.radius;
+    const around = (values, sign) => values.map((value, axis) => point[axis] + 1.5 * (value - point[axis]) + sign * least);
+    const near = this.#fitting(direction, centre, { low: around(box.low, -1), high: around(box.high, 1) });
+    const whole = this.#fitting(direction, centre, this.box);
+    this.#travelTo(centre, direction, near.distance < whole.distance ? near : whole, true);
   }
 
   rotate(leftRad, upRad) {
@@ -114,8 +132,8 @@ export class SceneView {
 
   zoom(factor) {
     this.touched = true;
-    const arm = this.camera.position.clone().sub(this.controls.target).multiplyScalar(factor);
-    this.#travel(this.controls.target.clone(), arm);
+    const { target, arm, shift } = this.flight?.to ?? { target: this.controls.target, arm: this.camera.position.clone().sub(this.controls.target), shift: this.shift };
+    this.#travel(target.clone(), arm.clone().multiplyScalar(factor), shift);
   }
 
   // [x, y] in CSS pixels and whether it lies before the camera.
@@ -129,30 +147,32 @@ export class SceneView {
     return this.camera.projectionMatrix.clone().multiply(this.camera.matrixWorldInverse).elements;
   }
 
-  // The distance at which all eight corners of the box are inside the view with a margin.
-  #fittingDistance(direction) {
+  // From how far, and about which pixel, all eight corners of the box are seen in a free part of the picture.
+  #fitting(direction, centre, box) {
     const forward = direction.clone().negate();
     const right = new Vector3().crossVectors(forward, this.camera.up).normalize();
     const up = new Vector3().crossVectors(right, forward);
-    const tangent = Math.tan((FIELD_OF_VIEW_DEG * Math.PI) / 360) * 0.86;
-    let distance = 0;
-    for (let corner = 0; corner < 8; corner += 1) {
-      const offset = new Vector3(...[0, 1, 2].map((axis) => (corner & (1 << axis) ? this.box.high : this.box.low)[axis])).sub(this.centre);
-      const toward = offset.dot(direction);
-      distance = Math.max(distance, toward + Math.abs(offset.dot(right)) / (tangent * this.camera.aspect), toward + Math.abs(offset.dot(up)) / tangent);
-    }
-    return Math.max(distance, 1.2 * this.radius);
+    const corners = Array.from({ length: 8 }, (_, corner) => {
+      const offset = new Vector3(...[0, 1, 2].map((axis) => (corner & (1 << axis) ? box.high : box.low)[axis])).sub(centre);
+      return [offset.dot(right), offset.dot(up), offset.dot(direction)];
+    });
+    return fitInto(corners, this.#focalPx, this.freeAreas(this.width, this.height), 0.3 * this.radius);
   }
 
-  #travel(target, arm, fly = true) {
+  #travelTo(target, direction, { distance, x, y }, fly) {
+    this.#travel(target, direction.clone().multiplyScalar(distance), [x - 0.5 * this.width, y - 0.5 * this.height], fly);
+  }
+
+  #travel(target, arm, shift, fly = true) {
     if (!fly || this.calm) {
       this.flight = null;
       this.controls.target.copy(target);
       this.camera.position.copy(target).add(arm);
+      this.shift = shift;
       this.controls.update();
     } else {
-      const from = { target: this.controls.target.clone(), arm: this.camera.position.clone().sub(this.controls.target) };
-      this.flight = { from, to: { target, arm }, start: performance.now() };
+      const from = { target: this.controls.target.clone(), arm: this.camera.position.clone().sub(this.controls.target), shift: this.shift };
+      this.flight = { from, to: { target, arm, shift }, start: performance.now() };
     }
     this.invalidate();
   }
@@ -165,6 +185,7 @@ export class SceneView {
     const arm = from.arm.clone().normalize().lerp(to.arm.clone().normalize(), eased);
     if (share === 1 || arm.lengthSq() < 1e-6) arm.copy(to.arm);
     this.controls.target.lerpVectors(from.target, to.target, eased);
+    this.shift = [0, 1].map((axis) => from.shift[axis] + (to.shift[axis] - from.shift[axis]) * eased);
     this.camera.position.copy(this.controls.target).add(arm.setLength(share === 1 ? to.arm.length() : length));
     this.controls.update();
     if (share === 1) this.flight = null;
@@ -177,7 +198,7 @@ export class SceneView {
     const toCentre = this.camera.position.distanceTo(this.centre);
     this.camera.near = Math.max(toCentre - 1.5 * this.radius, 1e-3 * (toCentre + this.radius));
     this.camera.far = toCentre + 2 * this.radius;
-    this.camera.updateProjectionMatrix();
+    this.camera.setViewOffset(this.width, this.height, -this.shift[0], -this.shift[1], this.width, this.height);
     this.camera.updateMatrixWorld();
     this.beforeDraw();
     this.renderer.render(this.scene, this.camera);

@@ -76,10 +76,15 @@ export class SessionView {
     return median > 0 ? 1 / Math.sqrt(median) : 0.3;
   }
 
-  // The required density when all regions name the same one, else null.
+  // The least and the most that is required of any region, points/mm², or null; it follows the spacing on the surface.
   get requiredPerMm2() {
     const all = (this.regions ?? []).map((region) => region.required_per_mm2).filter(Number.isFinite);
-    return all.length && Math.max(...all) - Math.min(...all) <= 0.01 * Math.max(...all) ? all[0] : null;
+    return all.length ? [Math.min(...all), Math.max(...all)] : null;
+  }
+
+  // Whether the service would start it: a new one, or one whose scanlines are pushed, as often as wanted.
+  get startable() {
+    return this.status !== null && (this.status.state === "created" || (OVER.has(this.status.state) && this.status.source?.kind === "push"));
   }
 
   #takeBinary(buffer) {

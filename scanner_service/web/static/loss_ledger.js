@@ -1,0 +1,79 @@
+// The service's tally of losses as balances that can be read: what came in, what was kept, what was not and why; pure.
+
+import { plural, sentence } from "./numbers.js";
+
+const NAMES = {
+  pending: "on the way to the record",
+  counted: "in the map",
+  dropout: "no return",
+  out_of_bounds: "beyond the map's bounds",
+  device_dropped: "dropped by the device",
+  bad_crc: "wrong checksum",
+  bad_cobs: "broken framing",
+  bytes_skipped: "bytes skipped",
+  points_declared: "points in the file",
+};
+
+const PLACES = { missing: "in a piece that never arrived" };
+
+const sum = (tally) => Object.values(tally ?? {}).reduce((total, count) => total + count, 0);
+
+// Rows are [name, count, kind]: kept, aside (no loss: a laser that finds no surface, a line that came twice) or lost.
+const row = (key, count, kind, prefix = "") => [sentence(`${prefix}${NAMES[key] ?? key}`), count ?? 0, kind];
+const rows = (tally, kind, prefix = "") => Object.entries(tally ?? {}).map(([key, count]) => row(key, count, kind, prefix));
+
+// [{title, unit, total, rows}], the total being null where nothing adds up to one.
+export function accounts(losses) {
+  const { lines, points, device, ...others } = losses ?? {};
+  const made = [];
+  if (points) {
+    const kinds = Object.entries(points.dropped ?? {}).map(([key, count]) => row(PLACES[key] ?? key, count, key === "dropout" ? "aside" : "lost"));
+    made.push({ title: "Points", unit: "places in the scanlines", total: points.places, rows: [row("counted", points.counted, "kept"), ...kinds, ...rows(points.left_out, "aside", "left out: ")] });
+  }
+  if (lines) {
+    const fate = [row("stored", lines.stored, "kept"), row("pending", lines.pending, "aside"), row("duplicates", lines.duplicates, "aside"), row("conflicts", lines.conflicts, "lost")];
+    made.push({ title: "Scanlines", unit: "received", total: lines.received, rows: [...fate, ...rows(lines.refused, "lost", "refused: ")] });
+  }
+  if (device) made.push(...(device.lines ? wireAccounts(device) : fileAccounts(device)));
+  for (const [key, tally] of Object.entries(others)) made.push({ title: sentence(key), unit: "", total: null, rows: rows(flat(tally, key), "aside") });
+  return made;
+}
+
+function wireAccounts({ lines, chunks, damage, bytes_skipped: bytesSkipped, duplicates, stale, disagreements }) {
+  const made = [
+    {
+      title: "Scanlines on the wire",
+      unit: "sent",
+      total: lines.sent,
+      rows: [row("whole", lines.whole, "kept"), row("partial", lines.partial, "lost"), row("open", lines.open, "aside"), ...rows(lines.lost, "lost", "lost: ")],
+    },
+  ];
+  if (chunks) made.push({ title: "Chunks on the wire", unit: "sent", total: chunks.sent, rows: [row("stored", chunks.stored, "kept"), ...rows(chunks.lost, "lost", "lost: ")] });
+  const noise = [...rows(damage, "lost", "damage: "), row("bytes_skipped", bytesSkipped, "aside"), row("duplicates", duplicates, "aside"), row("stale", stale, "aside"), row("disagreements", disagreements, "lost")];
+  made.push({ title: "Noise on the wire", unit: "", total: null, rows: noise });
+  return made;
+}
+
+function fileAccounts({ points_declared: declared, dropped, ...others }) {
+  if (declared === undefined) return [{ title: "Device", unit: "", total: null, rows: rows(flat({ dropped, ...others }), "aside") }];
+  const kept = ["Read", declared - sum(dropped), "kept"];
+  return [{ title: "File", unit: "points", total: declared, rows: [kept, ...rows(dropped, "lost"), ...rows(flat(others), "aside")] }];
+}
+
+// A tally nested as deep as it likes, as one of names and counts.
+function flat(tally, name = "", into = {}) {
+  if (typeof tally === "number") into[name] = tally;
+  else for (const [key, part] of Object.entries(tally ?? {})) flat(part, name ? `${name}, ${key}` : key, into);
+  return into;
+}
+
+// The one line that says it all: what was lost for good. A place without a return is no loss of the service's.
+export function headline(losses) {
+  if (!losses) return "";
+  const { lines, points, device } = losses;
+  const lostLines = sum(lines?.refused) + (lines?.conflicts ?? 0) + sum(device?.lines?.lost);
+  const { dropout: _, ...lostInMap } = points?.dropped ?? {};
+  const lostPoints = sum(lostInMap) + (device?.lines ? 0 : sum(device?.dropped));
+  const said = [lostLines && plural(lostLines, "scanline", "scanlines"), lostPoints && plural(lostPoints, "point", "points")].filter(Boolean);
+  return said.length ? `${said.join(", ")} lost` : "nothing lost";
+}

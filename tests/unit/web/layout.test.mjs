@@ -1,0 +1,93 @@
+// Laws of what is put where and said how: fitting a box into the free picture, room for labels, the ledger of losses.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+const { fitInto } = await import("../../../scanner_service/web/static/fitting.js");
+const { roomFor } = await import("../../../scanner_service/web/static/label_places.js");
+const { accounts, headline } = await import("../../../scanner_service/web/static/loss_ledger.js");
+
+// a small linear congruential generator: the same draws on every machine
+function draws(seed) {
+  let state = seed;
+  return (low, high) => {
+    state = (1664525 * state + 1013904223) % 2 ** 32;
+    return low + ((high - low) * state) / 2 ** 32;
+  };
+}
+
+const FOCAL_PX = 1200;
+const seenAt = ([right, up, toward], { distance, x, y }) => [x + (FOCAL_PX * right) / (distance - toward), y - (FOCAL_PX * up) / (distance - toward)];
+
+test("every corner of a box is seen inside a free area, and the box fills its width or its height", () => {
+  const draw = draws(1);
+  for (let i = 0; i < 200; i += 1) {
+    const corners = Array.from({ length: 8 }, () => [draw(-40, 60), draw(-30, 30), draw(-20, 25)]);
+    const area = { left: draw(0, 200), top: draw(0, 100), right: draw(500, 900), bottom: draw(300, 700) };
+    const fit = fitInto(corners, FOCAL_PX, [area]);
+    const seen = corners.map((corner) => seenAt(corner, fit));
+    const [xs, ys] = [seen.map(([x]) => x), seen.map(([, y]) => y)];
+    assert.ok(Math.min(...xs) >= area.left - 1e-3 && Math.max(...xs) <= area.right + 1e-3);
+    assert.ok(Math.min(...ys) >= area.top - 1e-3 && Math.max(...ys) <= area.bottom + 1e-3);
+    const filled = Math.max((Math.max(...xs) - Math.min(...xs)) / (area.right - area.left), (Math.max(...ys) - Math.min(...ys)) / (area.bottom - area.top));
+    assert.ok(filled > 0.999, `only ${filled} of the area is used`);
+  }
+});
+
+test("of two areas the one is chosen that shows the box larger", () => {
+  const tall = [[-5, -20, 0], [5, 20, 0]];
+  const beside = { left: 300, top: 50, right: 900, bottom: 700 };
+  const above = { left: 0, top: 50, right: 900, bottom: 450 };
+  assert.equal(fitInto(tall, FOCAL_PX, [above, beside]).x, 600);
+  const wide = [[-20, -5, 0], [20, 5, 0]];
+  assert.equal(fitInto(wide, FOCAL_PX, [above, beside]).x, 450);
+});
+
+test("a single point is seen from the nearest distance allowed", () => {
+  assert.equal(fitInto([[0, 0, 0]], FOCAL_PX, [{ left: 0, top: 0, right: 100, bottom: 100 }], 7).distance, 7);
+});
+
+test("labels that are shown never cover each other, the first is always among them, and what is not shown would have covered one", () => {
+  const draw = draws(2);
+  const labels = Array.from({ length: 60 }, (_, i) => ({ x: draw(0, 400), y: draw(0, 300), text: String(i + 1) }));
+  const shown = [...roomFor(labels, 1000)];
+  const width = ({ text }) => 16 + 8 * text.length;
+  const apart = (a, b) => Math.abs(a.x - b.x) >= 0.5 * (width(a) + width(b)) || Math.abs(a.y - b.y) >= 24;
+  assert.equal(shown[0], labels[0]);
+  for (const a of shown) for (const b of shown) assert.ok(a === b || apart(a, b));
+  for (const label of labels) assert.ok(shown.includes(label) || shown.some((other) => labels.indexOf(other) < labels.indexOf(label) && !apart(other, label)));
+  assert.equal(roomFor(labels, 3).size, 3);
+});
+
+const LOSSES = {
+  lines: { received: 410, pending: 3, stored: 400, duplicates: 4, conflicts: 1, refused: { invalid: 2 } },
+  points: { places: 1000, counted: 700, dropped: { dropout: 250, missing: 30 }, left_out: { stationary: 20 } },
+  device: {
+    chunks: { sent: 3300, stored: 3290, lost: { damaged: 9, device_dropped: 1 } },
+    lines: { sent: 415, stored: 410, whole: 405, partial: 5, open: 1, lost: { disconnected: 4 } },
+    duplicates: 0, stale: 0, disagreements: 0, damage: { bad_crc: 9 }, bytes_skipped: 4600,
+  },
+};
+
+test("whatever came in is found again in the rows of its account", () => {
+  const balanced = accounts(LOSSES).filter(({ total }) => total !== null);
+  assert.deepEqual(balanced.map(({ title, total }) => [title, total]), [["Points", 1000], ["Scanlines", 410], ["Scanlines on the wire", 415], ["Chunks on the wire", 3300]]);
+  for (const { title, total, rows } of balanced) assert.equal(rows.reduce((sum, [, count]) => sum + count, 0), total, title);
+  const noise = accounts(LOSSES).find(({ title }) => title === "Noise on the wire");
+  assert.deepEqual(noise.rows.filter(([, count]) => count > 0), [["Damage: wrong checksum", 9, "lost"], ["Bytes skipped", 4600, "aside"]]);
+});
+
+test("the headline counts what was lost for good, and no place without a return", () => {
+  assert.equal(headline(LOSSES), "7 scanlines, 30 points lost");
+  assert.equal(headline({ points: { dropped: { dropout: 99 } }, lines: { refused: {} }, device: null }), "nothing lost");
+  assert.equal(headline({ lines: { conflicts: 1, refused: {} }, device: null }), "1 scanline lost");
+  assert.equal(headline(null), "");
+});
+
+test("a file's account and a tally of a shape unknown here are told too", () => {
+  const [file] = accounts({ device: { points_declared: 40256, dropped: { not_finite: 6 } } });
+  assert.deepEqual([file.title, file.total, file.rows], ["File", 40256, [["Read", 40250, "kept"], ["Not finite", 6, "lost"]]]);
+  const [other] = accounts({ robot: { stops: 2, moves: { late: 3 } } });
+  assert.deepEqual(other.rows.map(([name, count]) => [name, count]), [["Robot, stops", 2], ["Robot, moves, late", 3]]);
+  assert.deepEqual(accounts(null), []);
+});
