@@ -175,7 +175,7 @@ def _conclude(
     block_needy, cell_block, cell_at = grid.block_needy, grid.cell_block, grid.cell_at
     max_radius_mm = rules.max_radius_mm
     wide = np.empty((4, 1))
-    wide_cell, n_wide = np.int64(-1), np.int64(0)
+    wide_cell, wide_mm, n_wide = np.int64(-1), 0.0, np.int64(0)
     fit_planes(sums, n, fits)
     for i in range(n):
         row, cell = rows[i], row_cells[i]
@@ -190,9 +190,9 @@ def _conclude(
             limit_mm = _radius_limit_mm(base_mm, max_radius_mm)
             if limit_mm > base_mm:
                 block_needy[cell_block[cell]] |= np.uint64(1) << np.uint64(place_in_block(cell_at, cell))
-                if wide_cell != cell:
+                if wide_cell != cell or limit_mm > wide_mm:
                     wide, n_wide = _gather_wide(grid, cell, limit_mm, wide)
-                    wide_cell = cell
+                    wide_cell, wide_mm = cell, limit_mm
                 step = _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules, sums, fits, i)
                 if step > 0:
                     reason = 0

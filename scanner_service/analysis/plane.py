@@ -83,9 +83,12 @@ def _smallest_root(a: float, b: float, c: float, d: float, e: float, f: float) -
     return mean + 2.0 * p * math.cos(angle + 2.0943951023931953)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"nsz", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def fit_planes(sums: npt.NDArray[np.float64], n: int, fits: npt.NDArray[np.float64]) -> None:
     """Fit many planes at once: the same as `smallest_axis`, without a branch, for vector registers.
+
+    No fast-math: fused operations would give a column other last bits in a full register than in the remainder, and
+    the answer must not depend on who shares the batch.
 
     `sums` (13, N) in its first n columns: count, three rows not read here, sums of x, y, z, and of xx xy xz yy yz zz,
     of offsets from the points themselves. `fits` (8, N): axis (3 rows), lambda1, lambda2, lambda3, 1 where Newton's
