@@ -27,12 +27,12 @@ class Grid(NamedTuple):
     """The grid's arrays; `*_used` are one-element counters, index -1 means none.
 
     `hash_block` (2^k,) holds block + 1 or 0; `block_key` (B, 3) block coordinates; `block_near` (B, 27) neighbouring
-    blocks; `block_cell` (B, 64) the cell at each place; `block_needy` (B,) a bit for each cell with a point whose
-    radius had to grow, `block_round` (B,) the round in which those around were queued. `cell_at` (C, 3) cell
-    coordinates, `cell_block` (C,), `cell_first`, `cell_last` (C,) chunks, `cell_count` (C,) points, `cell_stale` (C,)
-    QUEUED in `stale` (C,), or SPREAD when its neighbours are queued too. `chunk_next` (K,), `chunk_xyz` (K, 3, CHUNK)
-    int32 coordinates, `chunk_line` (K, CHUNK) scanlines and `chunk_point` (K, CHUNK) point rows. `round` counts
-    evaluations.
+    blocks; `block_cell` (B, 64) the cell at each place; `block_needy` (B,) 1 once one of its cells was needy, and
+    `block_round` (B,) the round in which those around were queued. `cell_at` (C, 3) cell coordinates, `cell_block`
+    (C,), `cell_first`, `cell_last` (C,) chunks, `cell_count` (C,) points, `cell_needy` (C,) 1 when a point of it looks
+    farther than the neighbouring cells, `cell_stale` (C,) QUEUED in `stale` (C,), or SPREAD when its neighbours are
+    queued too. `chunk_next` (K,), `chunk_xyz` (K, 3, CHUNK) int32 coordinates, `chunk_line` (K, CHUNK) scanlines and
+    `chunk_point` (K, CHUNK) point rows, ascending along a cell. `round` counts evaluations.
     """
 
     side_q: npt.NDArray[np.int64]
@@ -41,7 +41,7 @@ class Grid(NamedTuple):
     block_key: Int32Array
     block_near: Int32Array
     block_cell: Int32Array
-    block_needy: npt.NDArray[np.uint64]
+    block_needy: UInt8Array
     block_round: Int32Array
     cells_used: npt.NDArray[np.int64]
     cell_at: Int32Array
@@ -50,6 +50,7 @@ class Grid(NamedTuple):
     cell_last: Int32Array
     cell_count: Int32Array
     cell_stale: UInt8Array
+    cell_needy: UInt8Array
     stale_used: npt.NDArray[np.int64]
     stale: Int32Array
     chunks_used: npt.NDArray[np.int64]
@@ -76,7 +77,7 @@ def reserve_grid(side_q: int, max_points: int) -> Grid:
         block_key=np.empty((blocks, 3), dtype=np.int32),
         block_near=np.empty((blocks, 27), dtype=np.int32),
         block_cell=np.empty((blocks, BLOCK_CELLS), dtype=np.int32),
-        block_needy=np.zeros(blocks, dtype=np.uint64),
+        block_needy=np.zeros(blocks, dtype=np.uint8),
         block_round=np.zeros(blocks, dtype=np.int32),
         cells_used=counter(),
         cell_at=np.empty((cells, 3), dtype=np.int32),
@@ -85,6 +86,7 @@ def reserve_grid(side_q: int, max_points: int) -> Grid:
         cell_last=np.empty(cells, dtype=np.int32),
         cell_count=np.empty(cells, dtype=np.int32),
         cell_stale=np.empty(cells, dtype=np.uint8),
+        cell_needy=np.empty(cells, dtype=np.uint8),
         stale_used=counter(),
         stale=np.empty(cells, dtype=np.int32),
         chunks_used=counter(),
@@ -157,14 +159,19 @@ def cell_near(cell_at, cell_block, block_key, block_near, block_cell, cell, dx, 
 
 
 @njit(cache=True, nogil=True)
-def place_in_block(cell_at, cell):
-    """The place of a cell among the 64 of its block."""
-    return ((cell_at[cell, 0] & 3) << 4) | ((cell_at[cell, 1] & 3) << 2) | (cell_at[cell, 2] & 3)
+def cell_of(grid: Grid, x: int, y: int, z: int) -> int:
+    """The cell at these cell coordinates, or -1 when nothing is there."""
+    block = grid.hash_block[_slot(grid.hash_block, grid.block_key, x >> 2, y >> 2, z >> 2)] - 1
+    if block < 0:
+        return np.int64(-1)
+    return np.int64(grid.block_cell[block, ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)])
 
 
 @njit(cache=True, nogil=True)
-def insert_points(grid: Grid, points: PointArray, first_row: int, cell_limit: int, counted: UInt8Array) -> int:
-    """Put the points of rows first_row, first_row + 1, ... into their cells; queue what they reach.
+def insert_points(
+    grid: Grid, points: PointArray, first_row: int, line: int, cell_limit: int, counted: UInt8Array
+) -> int:
+    """Put the points of a line, rows first_row, first_row + 1, ..., into their cells; queue what they reach.
 
     What they reach: their cells, the 26 around each, and the needy cells of the blocks around. A cell that is made
     later in the round queues itself, so what was spread once in a round needs no second time.
@@ -174,6 +181,7 @@ def insert_points(grid: Grid, points: PointArray, first_row: int, cell_limit: in
     """
     hash_block, blocks_used, block_key = grid.hash_block, grid.blocks_used, grid.block_key
     block_near, block_cell, block_needy = grid.block_near, grid.block_cell, grid.block_needy
+    cell_needy = grid.cell_needy
     block_round, cells_used, cell_at, cell_block = grid.block_round, grid.cells_used, grid.cell_at, grid.cell_block
     cell_first, cell_last, cell_count, cell_stale = grid.cell_first, grid.cell_last, grid.cell_count, grid.cell_stale
     stale_used, stale, chunks_used, chunk_next = grid.stale_used, grid.stale, grid.chunks_used, grid.chunk_next
@@ -206,19 +214,14 @@ def insert_points(grid: Grid, points: PointArray, first_row: int, cell_limit: in
                 cell_last[cell] = -1
                 cell_count[cell] = 0
                 cell_stale[cell] = 0
+                cell_needy[cell] = 0
             if cell_stale[cell] != SPREAD:
-                for dx in range(-1, 2):
-                    for dy in range(-1, 2):
-                        for dz in range(-1, 2):
-                            near = cell_near(cell_at, cell_block, block_key, block_near, block_cell, cell, dx, dy, dz)
-                            if near >= 0 and cell_stale[near] == 0:
-                                cell_stale[near] = QUEUED
-                                stale[stale_used[0]] = near
-                                stale_used[0] += 1
-                cell_stale[cell] = SPREAD
+                _queue_around(
+                    cell_at, cell_block, block_key, block_near, block_cell, cell_stale, stale, stale_used, cell
+                )
                 if block_round[block] != this_round:
                     block_round[block] = this_round
-                    _queue_needy(block_near, block_needy, block_cell, cell_stale, stale, stale_used, block)
+                    _queue_needy(block_near, block_needy, block_cell, cell_needy, cell_stale, stale, stale_used, block)
             lx, ly, lz = x, y, z
         count = cell_count[cell]
         if count >= cell_limit:
@@ -227,39 +230,103 @@ def insert_points(grid: Grid, points: PointArray, first_row: int, cell_limit: in
         place = count % CHUNK
         chunk = np.int64(cell_last[cell])
         if place == 0:
-            chunk = chunks_used[0]
-            if chunk >= len(chunk_next):
-                return i
-            chunks_used[0] = chunk + 1
-            chunk_next[chunk] = -1
-            if count == 0:
-                cell_first[cell] = chunk
+            if count == 0 and chunk >= 0:  # emptied by a removal: its first chunk is free again
+                chunk = np.int64(cell_first[cell])
+            elif count > 0 and chunk_next[chunk] >= 0:  # shortened by a removal
+                chunk = np.int64(chunk_next[chunk])
             else:
-                chunk_next[cell_last[cell]] = chunk
+                chunk = chunks_used[0]
+                if chunk >= len(chunk_next):
+                    return i
+                chunks_used[0] = chunk + 1
+                chunk_next[chunk] = -1
+                if count == 0:
+                    cell_first[cell] = chunk
+                else:
+                    chunk_next[cell_last[cell]] = chunk
             cell_last[cell] = chunk
         chunk_xyz[chunk, 0, place] = px
         chunk_xyz[chunk, 1, place] = py
         chunk_xyz[chunk, 2, place] = pz
-        chunk_line[chunk, place] = points[row].line
+        chunk_line[chunk, place] = line
         chunk_point[chunk, place] = row
         cell_count[cell] = count + 1
     return len(counted)
 
 
 @njit(cache=True, nogil=True)
-def _queue_needy(block_near, block_needy, block_cell, cell_stale, stale, stale_used, block):
+def _queue_around(cell_at, cell_block, block_key, block_near, block_cell, cell_stale, stale, stale_used, cell):
+    """Queue a cell and the 26 around it."""
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                near = cell_near(cell_at, cell_block, block_key, block_near, block_cell, cell, dx, dy, dz)
+                if near >= 0 and cell_stale[near] == 0:
+                    cell_stale[near] = QUEUED
+                    stale[stale_used[0]] = near
+                    stale_used[0] += 1
+    cell_stale[cell] = SPREAD
+
+
+@njit(cache=True, nogil=True)
+def remove_points(grid: Grid, points: PointArray, rows: Int32Array) -> int:
+    """Take points out of their cells and queue what they reached; returns how many were found there."""
+    block_key, block_near, block_cell = grid.block_key, grid.block_near, grid.block_cell
+    block_needy, cell_at, cell_block, cell_stale = grid.block_needy, grid.cell_at, grid.cell_block, grid.cell_stale
+    cell_needy = grid.cell_needy
+    stale, stale_used, cell_first, cell_last = grid.stale, grid.stale_used, grid.cell_first, grid.cell_last
+    cell_count, chunk_next, chunk_point = grid.cell_count, grid.chunk_next, grid.chunk_point
+    chunk_xyz, chunk_line, side = grid.chunk_xyz, grid.chunk_line, grid.side_q[0]
+    removed = 0
+    for i in range(len(rows)):
+        row = rows[i]
+        cell = cell_of(grid, points[row].x // side, points[row].y // side, points[row].z // side)
+        if cell < 0:
+            continue
+        # Everything behind the row moves one place forward: the rows of a cell stay in ascending order.
+        to_chunk, to_place, found = np.int64(-1), 0, False
+        chunk, left = cell_first[cell], cell_count[cell]
+        before_last = np.int64(-1)
+        while left > 0:
+            for j in range(min(left, CHUNK)):
+                if found:
+                    for axis in range(3):
+                        chunk_xyz[to_chunk, axis, to_place] = chunk_xyz[chunk, axis, j]
+                    chunk_line[to_chunk, to_place] = chunk_line[chunk, j]
+                    chunk_point[to_chunk, to_place] = chunk_point[chunk, j]
+                elif chunk_point[chunk, j] == row:
+                    found = True
+                if found:
+                    to_chunk, to_place = chunk, j
+            left -= CHUNK
+            if left > 0:
+                before_last = chunk
+            chunk = chunk_next[chunk]
+        if not found:
+            continue
+        removed += 1
+        cell_count[cell] -= 1
+        if cell_count[cell] % CHUNK == 0 and cell_count[cell] > 0:
+            cell_last[cell] = before_last
+        _queue_around(cell_at, cell_block, block_key, block_near, block_cell, cell_stale, stale, stale_used, cell)
+        block = cell_block[cell]
+        _queue_needy(block_near, block_needy, block_cell, cell_needy, cell_stale, stale, stale_used, block)
+    return removed
+
+
+@njit(cache=True, nogil=True)
+def _queue_needy(block_near, block_needy, block_cell, cell_needy, cell_stale, stale, stale_used, block):
     """Queue the cells around whose points look farther than their neighbours."""
     for i in range(27):
         other = block_near[block, i]
         if other < 0 or block_needy[other] == 0:
             continue
         for place in range(BLOCK_CELLS):
-            if (block_needy[other] >> np.uint64(place)) & np.uint64(1):
-                cell = block_cell[other, place]
-                if cell_stale[cell] == 0:
-                    cell_stale[cell] = QUEUED
-                    stale[stale_used[0]] = cell
-                    stale_used[0] += 1
+            cell = block_cell[other, place]
+            if cell >= 0 and cell_needy[cell] != 0 and cell_stale[cell] == 0:
+                cell_stale[cell] = QUEUED
+                stale[stale_used[0]] = cell
+                stale_used[0] += 1
 
 
 @njit(cache=True, nogil=True)

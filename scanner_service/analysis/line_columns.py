@@ -8,7 +8,7 @@ import numpy.typing as npt
 from drivers.scanline import Float64Array
 from scanner_service.analysis.intake import QUANTUM_MM, StoredLine
 from scanner_service.analysis.passes import Pass
-from scanner_service.analysis.snapshot import LineTable, UInt8Array
+from scanner_service.analysis.snapshot import Int32Array, LineTable, UInt8Array
 
 _ROW = np.dtype(
     [
@@ -17,6 +17,7 @@ _ROW = np.dtype(
         ("pass_number", np.int32),
         ("line_index", np.int64),
         ("point_count", np.int32),
+        ("first_row", np.int32),
         ("laser_mm", np.float64, 3),
         ("plane_normal", np.float64, 3),
         ("travel", np.float64, 3),
@@ -37,6 +38,7 @@ class LineColumns:
         self._laser_q = np.zeros((256, 3))
         self._pass_bit: UInt8Array = np.zeros(256, dtype=np.uint8)
         self._used = 0
+        self.laser_box_q = np.array([[np.inf] * 3, [-np.inf] * 3])
         self._devices: dict[str, int] = {}
 
     def __len__(self) -> int:
@@ -48,9 +50,10 @@ class LineColumns:
         of: Pass,
         point_spacing_mm: float,
         stationary: bool,
+        first_row: int,
         origin_mm: Float64Array,
     ) -> int:
-        """Add a line; returns its row."""
+        """Add a line whose points begin at `first_row`; returns its row."""
         if self._used == len(self._rows):
             self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
             self._laser_q = np.concatenate([self._laser_q, np.zeros_like(self._laser_q)])
@@ -62,6 +65,7 @@ class LineColumns:
             of.number,
             line.line_index,
             line.point_count,
+            first_row,
             line.laser_mm,
             line.plane_normal,
             line.travel,
@@ -71,7 +75,10 @@ class LineColumns:
             point_spacing_mm,
             stationary,
         )
-        self._laser_q[row] = (line.laser_mm - origin_mm) / QUANTUM_MM
+        laser_q = (line.laser_mm - origin_mm) / QUANTUM_MM
+        self._laser_q[row] = laser_q
+        self.laser_box_q[0] = np.minimum(self.laser_box_q[0], laser_q)
+        self.laser_box_q[1] = np.maximum(self.laser_box_q[1], laser_q)
         self._pass_bit[row] = 1 << of.slot if of.slot >= 0 else 0
         self._used = row + 1
         return row
@@ -79,6 +86,19 @@ class LineColumns:
     def drop_pass(self, pass_number: int) -> None:
         """The lines of a closed pass no longer hold anything open."""
         self._pass_bit[: self._used][self._rows["pass_number"][: self._used] == pass_number] = 0
+
+    def ranges(self, used: int, pass_number: int | None = None) -> list[tuple[int, int, int]]:
+        """(line, first row, end row) of the lines, or of one pass, whose points are among the first `used` rows."""
+        rows = self._rows[: self._used]
+        first = rows["first_row"]
+        end = np.minimum(np.append(first[1:], used), used)
+        chosen = (end > first) if pass_number is None else (end > first) & (rows["pass_number"] == pass_number)
+        return [(int(line), int(first[line]), int(end[line])) for line in np.flatnonzero(chosen)]
+
+    def line_of(self, rows: Int32Array) -> Int32Array:
+        """(m,) line of each row of points."""
+        found = np.searchsorted(self._rows["first_row"][: self._used], rows, side="right") - 1
+        return found.astype(np.int32)
 
     def kernel_columns(self) -> tuple[npt.NDArray[np.float64], UInt8Array]:
         """Laser positions (L, 3) in quanta from the origin and pass bits (L,), as views."""
@@ -93,5 +113,5 @@ class LineColumns:
 
         return LineTable(
             device_ids=tuple(self._devices),
-            **{name: column(name) for name in _ROW.names or ()},
+            **{name: column(name) for name in _ROW.names or () if name != "first_row"},
         )

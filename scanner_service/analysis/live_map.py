@@ -16,7 +16,15 @@ import numpy.typing as npt
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.errors import MapFull
-from scanner_service.analysis.grid import SMALLEST_SIDE_Q, insert_points, queue_all, reserve_grid, take_stale
+from scanner_service.analysis.global_radius import GlobalRadius
+from scanner_service.analysis.grid import (
+    SMALLEST_SIDE_Q,
+    insert_points,
+    queue_all,
+    remove_points,
+    reserve_grid,
+    take_stale,
+)
 from scanner_service.analysis.intake import QUANTUM_MM, StoredLine
 from scanner_service.analysis.line_columns import LineColumns
 from scanner_service.analysis.neighbourhood import (
@@ -24,11 +32,13 @@ from scanner_service.analysis.neighbourhood import (
     Rules,
     drop_pass,
     evaluate_cells,
+    flexible_radii_mm,
     list_unsettled,
     settle_listed,
 )
 from scanner_service.analysis.passes import Pass, PassBook, PassKey
 from scanner_service.analysis.points import (
+    GROWTH_REACH,
     LISTED,
     NOT_COUNTED,
     PointArray,
@@ -110,7 +120,10 @@ class LiveMap:
             noise_mm=self.settings.noise_mm,
             max_error_rad=self.settings.max_normal_error_rad,
             max_radius_mm=self._max_radius_mm(),
+            is_flexible=self.settings.radius.rule == "flexible",
+            uncertainty_mm=self.settings.radius.uncertainty_mm,
         )
+        self._global = GlobalRadius() if self.settings.radius.rule == "global" else None
         self._pool = ThreadPoolExecutor(self.settings.threads) if self.settings.threads > 1 else None
 
     def __len__(self) -> int:
@@ -153,14 +166,18 @@ class LiveMap:
                 raise ValueError("radius_mm must hold one positive finite radius a point")
             rule = given_by
             common = float(radius_mm.max(initial=0.0)) or common
+        elif self._rules.is_flexible:
+            common, rule = self._rules.max_radius_mm, RadiusRule.FLEXIBLE
+        elif self._global is not None and self._global.radius_mm is not None:
+            common, rule = self._global.radius_mm, RadiusRule.GLOBAL
         self.can_take(line)
         of = self._passes.enter(line)
         stationary = of.slot >= 0 and of.stands_still_at(line)
-        row = self._lines.append(line, of, spacing, stationary, self.origin_mm)
         first, last = self._used, self._used + len(line.index)
+        row = self._lines.append(line, of, spacing, stationary, first, self.origin_mm)
         said = Unreliable.NOT_COUNTED if stationary else Unreliable.TOO_FEW
         radii = np.array([common]) if radius_mm is None else np.ascontiguousarray(radius_mm, dtype=np.float64)
-        write_points(self._points, first, line.xyz_q, line.index, row, radii, int(rule), int(said))
+        write_points(self._points, first, line.xyz_q, line.index, radii, int(rule), int(said))
         self._used = last
         if stationary:
             self._grid_rows = last
@@ -168,8 +185,13 @@ class LiveMap:
             return Accepted(row, common, 0, {"stationary": last - first} if last > first else {})
         if of.slot >= 0:
             self._follow(of, line)
-        self._reach_at_least(common)
-        over_dense = self._insert(first, last)
+        if self._rules.is_flexible or self._global is not None:
+            self._reach_at_least(self._rules.max_radius_mm / GROWTH_REACH)  # a search reaches that many cells
+        if not self._rules.is_flexible:
+            self._reach_at_least(common)
+        over_dense = self._insert(row, first, last)
+        if self._global is not None and self._global.wants_estimate(line, first, last):
+            self._estimate_global()
         return Accepted(row, common, last - first - over_dense, {"over_dense": over_dense} if over_dense else {})
 
     def close_pass(self, key: PassKey) -> None:
@@ -179,6 +201,24 @@ class LiveMap:
             return
         drop_pass(self._listed[: self._listed_used], self._points, 1 << closed.slot)
         self._lines.drop_pass(closed.number)
+
+    def withdraw_pass(self, key: PassKey) -> int:
+        """Take a pass out of the map, which then answers as if it had never had it; returns how many points that were.
+
+        The rows stay, marked as not counted, and so do the raw lines in the record. A pass that is unknown or already
+        withdrawn has nothing to take out.
+        """
+        self.close_pass(key)
+        number = self._passes.number_of(key)
+        if number is None:
+            return 0
+        count = 0
+        for _, first, last in self._lines.ranges(self._used, number):
+            rows = first + np.flatnonzero(self._points["unreliable"][first:last] != NOT_COUNTED)
+            count += int(remove_points(self._grid, self._points, rows.astype(np.int32)))
+            self._leave_out(rows)
+        self._first_new = 0
+        return count
 
     def close_all_passes(self) -> None:
         """Close every pass that is open."""
@@ -213,18 +253,22 @@ class LiveMap:
         side_mm = radius_mm if self._largest_radius_mm == 0.0 else 1.25 * radius_mm
         side_q = max(math.ceil(side_mm / QUANTUM_MM), SMALLEST_SIDE_Q)
         self._largest_radius_mm = radius_mm
+        self._build_grid(side_q)
+
+    def _build_grid(self, side_q: int) -> None:
+        """Build the grid anew with cells of this side; every point is evaluated again with the next reading."""
         self._grid = reserve_grid(side_q, self.settings.max_points)
         self._first_new = 0
         rows, self._grid_rows = self._grid_rows, 0
-        if rows:
-            self._insert(0, rows)
+        for line, first, last in self._lines.ranges(rows):
+            self._insert(line, first, last)
 
-    def _insert(self, first: int, last: int) -> int:
-        """Put rows into the grid; returns how many a full cell had to leave out."""
+    def _insert(self, line: int, first: int, last: int) -> int:
+        """Put the rows of a line into the grid; returns how many a full cell had to leave out."""
         said = self._points["unreliable"][first:last]
         counted = (said != NOT_COUNTED).astype(np.uint8)
         wanted = int(counted.sum())
-        taken = insert_points(self._grid, self._points, first, self.settings.cell_limit, counted)
+        taken = insert_points(self._grid, self._points, first, line, self.settings.cell_limit, counted)
         if taken < last - first:
             raise MapFull("the live map has no cells left: the points are scattered too widely for max_points")
         self._grid_rows = last
@@ -233,10 +277,30 @@ class LiveMap:
             self._leave_out(first + np.flatnonzero((counted == 0) & (said != NOT_COUNTED)))
         return left_out
 
+    def _estimate_global(self) -> None:
+        """Take the median of the sample's flexible radii as the radius of the whole cloud, and re-key the map by it."""
+        if self._global is None:
+            return
+        rows = self._global.sample()
+        rows = rows[self._points["unreliable"][rows] != NOT_COUNTED]
+        radii = np.empty(len(rows))
+        flexible_radii_mm(rows, self._grid, self._points, self._rules, radii)
+        radius_mm = self._global.settle_on(radii, self._used)
+        if radius_mm is None:
+            return
+        self._points["radius_mm"][: self._used] = radius_mm
+        self._points["rule"][: self._used] = RadiusRule.GLOBAL
+        self._largest_radius_mm = radius_mm
+        side_mm = max(radius_mm, self._rules.max_radius_mm / GROWTH_REACH)
+        self._build_grid(max(math.ceil(side_mm / QUANTUM_MM), SMALLEST_SIDE_Q))
+
     def _leave_out(self, rows: npt.NDArray[np.int64]) -> None:
-        """Keep rows without counting them."""
+        """Keep rows without counting them, and without an answer."""
         self._points["unreliable"][rows] = NOT_COUNTED
-        self._points["neighbours"][rows] = 0
+        for name in ("neighbours", "other_side", "growth"):
+            self._points[name][rows] = 0
+        for name in ("nx", "ny", "nz", "middle_mm2", "smallest_mm2", "offset_sq"):
+            self._points[name][rows] = np.nan
         self._points["open_passes"][rows] &= LISTED
         self._pending.append(rows.astype(np.int32))
 
@@ -306,11 +370,12 @@ class LiveMap:
             version=self.version,
             origin_mm=self.origin_mm.copy(),
             points_mm=self.origin_mm + np.column_stack([points["x"], points["y"], points["z"]]) * QUANTUM_MM,
-            line=np.ascontiguousarray(points["line"]),
+            line=self._lines.line_of(rows),
             index=np.ascontiguousarray(points["place"]),
             radius_mm=radius,
             radius_rule=np.where(points["growth"] > 0, np.uint8(RadiusRule.GROWN), points["rule"]),
             neighbours=neighbours,
+            same_side=neighbours - points["other_side"],
             density_per_mm2=neighbours / (math.pi * radius * radius),
             normals=normals,
             unreliable=unreliable,
@@ -324,7 +389,8 @@ class LiveMap:
 
     def _line_state(self) -> Lines:
         laser_q, pass_bit = self._lines.kernel_columns()
-        return Lines(laser_q, pass_bit, self._passes.open_bits, self._passes.heading, self._passes.front_q)
+        passes = self._passes
+        return Lines(laser_q, pass_bit, passes.open_bits, passes.heading, passes.front_q, self._lines.laser_box_q)
 
     def _max_radius_mm(self) -> float:
         limit = self.settings.max_radius_mm

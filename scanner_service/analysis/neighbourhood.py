@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from scanner_service.analysis.grid import CHUNK, Grid, cell_near, place_in_block
+from scanner_service.analysis.grid import CHUNK, Grid, cell_near, cell_of
 from scanner_service.analysis.intake import QUANTUM_MM
 from scanner_service.analysis.plane import fit_planes, smallest_axis
 from scanner_service.analysis.points import GROWTH, GROWTH_REACH, LISTED, MAX_OPEN_PASSES, PointArray
+from scanner_service.analysis.radius import FLEXIBLE_POINTS
 from scanner_service.analysis.snapshot import Int32Array, UInt8Array, Unreliable
 
 _TOO_FEW = int(Unreliable.TOO_FEW)
@@ -45,12 +46,18 @@ _BATCH = 64
 
 
 class Rules(NamedTuple):
-    """What makes a normal believed, and how far a radius may grow; the same for the whole map."""
+    """What makes a normal believed, and how far a radius may grow; the same for the whole map.
+
+    With `is_flexible` each point's radius is the distance to its 20th point, between `uncertainty_mm` and
+    `max_radius_mm`; otherwise the scanline's rule gave it, and it grows where that is needed.
+    """
 
     needs_lines: bool
     noise_mm: float
     max_error_rad: float
     max_radius_mm: float
+    is_flexible: bool
+    uncertainty_mm: float
 
 
 class Lines(NamedTuple):
@@ -59,7 +66,7 @@ class Lines(NamedTuple):
     `laser_q` (L, 3) laser positions in quanta from the origin; `pass_bit` (L,) the bit of the line's pass while that
     is open, else 0; `open_bits` (1,) all of these together. For each of the MAX_OPEN_PASSES: `heading` (., 3) the unit
     normal of its laser planes in the direction of travel, NaN when unknown or not steady, and `front_q` (.,) how far
-    along it the latest plane lies.
+    along it the latest plane lies. `laser_box_q` (2, 3) are the lowest and highest laser coordinates of all lines.
     """
 
     laser_q: npt.NDArray[np.float64]
@@ -67,12 +74,15 @@ class Lines(NamedTuple):
     open_bits: UInt8Array
     heading: npt.NDArray[np.float64]
     front_q: npt.NDArray[np.float64]
+    laser_box_q: npt.NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _radius_limit_mm(base_mm, max_radius_mm):
+def _radius_limit_mm(base_mm, rules):
     """r_max of a point whose rule gave `base_mm`."""
-    return max(base_mm, min(max_radius_mm, GROWTH_REACH * base_mm))
+    if rules.is_flexible:
+        return rules.max_radius_mm
+    return max(base_mm, min(rules.max_radius_mm, GROWTH_REACH * base_mm))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -97,7 +107,7 @@ def evaluate_cells(
     """
     cell_at, cell_block, cell_count = grid.cell_at, grid.cell_block, grid.cell_count
     cell_first, cell_last = grid.cell_first, grid.cell_last
-    block_key, block_near, block_cell, block_needy = grid.block_key, grid.block_near, grid.block_cell, grid.block_needy
+    block_key, block_near, block_cell, cell_needy = grid.block_key, grid.block_near, grid.block_cell, grid.cell_needy
     chunk_next, chunk_xyz, chunk_line, chunk_point = grid.chunk_next, grid.chunk_xyz, grid.chunk_line, grid.chunk_point
     pass_bit, open_bits = lines.pass_bit, np.uint8(lines.open_bits[0])
     is_exact = grid.side_q[0] < _EXACT_SIDE_Q and len(pass_bit) < _EXACT_LINES
@@ -106,7 +116,10 @@ def evaluate_cells(
     near = np.empty((4, 512))
     rows = np.empty(_BATCH, dtype=np.int64)
     row_cells = np.empty(_BATCH, dtype=np.int64)
+    row_lines = np.empty(_BATCH, dtype=np.int64)
     row_passes = np.empty(_BATCH, dtype=np.uint8)
+    wide = np.empty((4, 1))
+    distances = np.empty(512)
     sums = np.empty((13, _BATCH))
     fits = np.empty((8, _BATCH))
     n_batch = 0
@@ -117,16 +130,16 @@ def evaluate_cells(
         if n + _VECTOR > near.shape[1]:
             near = np.empty((4, 2 * n + _VECTOR))
             fresh = np.empty((3, 2 * n + _VECTOR))
-        bit = np.uint64(1) << np.uint64(place_in_block(cell_at, cell))
-        was_needy = block_needy[cell_block[cell]] & bit != 0
+        was_needy = cell_needy[cell] != 0
         n_fresh = np.int64(0)
         if was_needy:
-            block_needy[cell_block[cell]] &= ~bit
+            cell_needy[cell] = 0
         elif chunk_point[cell_first[cell], 0] < first_new:  # rows of a cell ascend: its first is its oldest
             n_fresh = _gather_fresh(
                 chunk_next, chunk_xyz, chunk_point, cell_first, cell_last, cell_count, found, n_found, first_new, fresh
             )
         is_gathered = False
+        n_wide = np.int64(-1)
         chunk = cell_first[cell]
         left = cell_count[cell]
         while left > 0:
@@ -138,23 +151,32 @@ def evaluate_cells(
                 if not is_gathered:
                     _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_found, near)
                     is_gathered = True
+                own = np.int64(chunk_line[chunk, j])
+                local, n_local = near, n
+                if rules.is_flexible:
+                    local, n_local, wide, n_wide = _choose_flexible_radius(
+                        grid, points, row, cell, near, n, wide, n_wide, distances, rules
+                    )
+                    if n_local + _VECTOR > len(distances):
+                        distances = np.empty(2 * n_local + _VECTOR)
                 reach = math.floor((points[row].radius_mm / QUANTUM_MM) ** 2)
-                _put(sums, n_batch, _sums_within(points, row, near, n, reach, is_exact))
-                passes = pass_bit[points[row].line]
+                _put(sums, n_batch, _sums_within(points, row, own, local, n_local, reach, is_exact))
+                passes = pass_bit[own]
                 if open_bits & ~passes:
-                    passes = _passes_in_reach(points, row, near, n, reach, pass_bit)
+                    passes = _passes_in_reach(points, row, passes, local, n_local, reach, pass_bit)
                 rows[n_batch], row_cells[n_batch], row_passes[n_batch] = row, cell, passes
+                row_lines[n_batch] = own
                 n_batch += 1
                 if n_batch == _BATCH:
                     n_changed = _conclude(
-                        rows, row_cells, row_passes, sums, fits, n_batch,
+                        rows, row_cells, row_lines, row_passes, sums, fits, n_batch,
                         grid, points, lines, rules, version, is_exact, changed, n_changed,
                     )  # fmt: skip
                     n_batch = 0
             left -= here
             chunk = chunk_next[chunk]
     return _conclude(
-        rows, row_cells, row_passes, sums, fits, n_batch,
+        rows, row_cells, row_lines, row_passes, sums, fits, n_batch,
         grid, points, lines, rules, version, is_exact, changed, n_changed,
     )  # fmt: skip
 
@@ -168,17 +190,30 @@ def _put(sums, column, values):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _conclude(
-    rows, row_cells, row_passes, sums, fits, n, grid, points, lines, rules, version, is_exact, changed, n_changed
+    rows,
+    row_cells,
+    row_lines,
+    row_passes,
+    sums,
+    fits,
+    n,
+    grid,
+    points,
+    lines,
+    rules,
+    version,
+    is_exact,
+    changed,
+    n_changed,
 ):
     """Fit a batch of points, let radii grow where that is needed, store the answers; the new number of changed rows."""
     laser_q, pass_bit, heading, front_q = lines.laser_q, lines.pass_bit, lines.heading, lines.front_q
-    block_needy, cell_block, cell_at = grid.block_needy, grid.cell_block, grid.cell_at
-    max_radius_mm = rules.max_radius_mm
+    block_needy, cell_block, cell_needy = grid.block_needy, grid.cell_block, grid.cell_needy
     wide = np.empty((4, 1))
     wide_cell, wide_mm, n_wide = np.int64(-1), 0.0, np.int64(0)
     fit_planes(sums, n, fits)
     for i in range(n):
-        row, cell = rows[i], row_cells[i]
+        row, cell, own = rows[i], row_cells[i], row_lines[i]
         base_mm = points[row].radius_mm
         passes = row_passes[i]
         if fits[6, i] == 0.0:
@@ -186,24 +221,133 @@ def _conclude(
         reason = _reason_against(sums, fits, i, rules)
         step = 0
         radius_mm = base_mm
-        if reason != 0:
-            limit_mm = _radius_limit_mm(base_mm, max_radius_mm)
-            if limit_mm > base_mm:
-                block_needy[cell_block[cell]] |= np.uint64(1) << np.uint64(place_in_block(cell_at, cell))
-                if wide_cell != cell or limit_mm > wide_mm:
-                    wide, n_wide = _gather_wide(grid, cell, limit_mm, wide)
-                    wide_cell, wide_mm = cell, limit_mm
-                step = _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules, sums, fits, i)
-                if step > 0:
-                    reason = 0
-                    radius_mm = min(base_mm * GROWTH**step, limit_mm)
-                    reach = math.floor((radius_mm / QUANTUM_MM) ** 2)
-                    passes = _passes_in_reach(points, row, wide, n_wide, reach, pass_bit)
-        passes = _not_gone_by(passes, points, row, heading, front_q, max_radius_mm)
-        if _store(points, row, sums, fits, i, reason, radius_mm, step, passes, laser_q, version):
+        limit_mm = _radius_limit_mm(base_mm, rules)
+        if reason != 0 and limit_mm > base_mm and not rules.is_flexible:
+            cell_needy[cell] = 1
+            block_needy[cell_block[cell]] = 1
+            if wide_cell != cell or limit_mm > wide_mm:
+                wide, n_wide = _gather_wide(grid, cell, limit_mm, wide)
+                wide_cell, wide_mm = cell, limit_mm
+            step = _grow(points, row, own, wide, n_wide, base_mm, limit_mm, is_exact, rules, sums, fits, i)
+            if step > 0:
+                reason = 0
+                radius_mm = min(base_mm * GROWTH**step, limit_mm)
+                reach = math.floor((radius_mm / QUANTUM_MM) ** 2)
+                passes = _passes_in_reach(points, row, passes, wide, n_wide, reach, pass_bit)
+        other_side = 0
+        if reason == 0:
+            _turn_to_laser(points, row, own, laser_q, fits, i)
+            if _lasers_on_both_sides(points, row, fits, i, radius_mm, lines.laser_box_q):
+                if wide_cell != cell or radius_mm > wide_mm:
+                    wide, n_wide = _gather_wide(grid, cell, radius_mm, wide)
+                    wide_cell, wide_mm = cell, radius_mm
+                other_side = _count_other_side(points, row, wide, n_wide, radius_mm, laser_q, fits, i)
+        passes = _not_gone_by(passes, points, row, heading, front_q, rules)
+        if _store(points, row, sums, fits, i, reason, radius_mm, step, passes, other_side, version):
             changed[n_changed] = row
             n_changed += 1
     return n_changed
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _turn_to_laser(points, row, own, laser_q, fits, i):
+    """Eq. 6.11: the axis is flipped when it points away from the laser of the point's own scanline."""
+    x, y, z = laser_q[own, 0] - points[row].x, laser_q[own, 1] - points[row].y, laser_q[own, 2] - points[row].z
+    if fits[0, i] * x + fits[1, i] * y + fits[2, i] * z < 0.0:
+        fits[0, i], fits[1, i], fits[2, i] = -fits[0, i], -fits[1, i], -fits[2, i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lasers_on_both_sides(points, row, fits, i, radius_mm, laser_box_q):
+    """False when every laser of the map stands so high above the point's plane that no neighbour is seen from below."""
+    lowest = -radius_mm / QUANTUM_MM
+    for axis in range(3):
+        n = fits[axis, i]
+        lowest += n * (laser_box_q[0, axis] if n > 0.0 else laser_box_q[1, axis])
+    x, y, z = points[row].x, points[row].y, points[row].z
+    return lowest <= fits[0, i] * x + fits[1, i] * y + fits[2, i] * z
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_other_side(points, row, local, n, radius_mm, laser_q, fits, i):
+    """Neighbours whose own ray comes from the other side of the point's plane."""
+    px, py, pz = np.int64(points[row].x), np.int64(points[row].y), np.int64(points[row].z)
+    reach = np.int64(math.floor((radius_mm / QUANTUM_MM) ** 2))
+    count = 0
+    for k in range(n):
+        x, y, z = np.int64(local[0, k]) - px, np.int64(local[1, k]) - py, np.int64(local[2, k]) - pz
+        if x * x + y * y + z * z <= reach:
+            at = np.int64(local[3, k])
+            height = fits[0, i] * (laser_q[at, 0] - local[0, k])
+            height += fits[1, i] * (laser_q[at, 1] - local[1, k])
+            height += fits[2, i] * (laser_q[at, 2] - local[2, k])
+            if height < 0.0:
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _choose_flexible_radius(grid, points, row, cell, near, n, wide, n_wide, distances, rules):
+    """Set the point's radius to the distance of its 20th point, between c and r_max.
+
+    Returns the buffer whose points cover that radius and how many they are, and the wide buffer with its count, which
+    is gathered at most once a cell. A point that looks beyond the neighbouring cells makes its cell needy.
+    """
+    limit = math.floor((rules.max_radius_mm / QUANTUM_MM) ** 2)
+    certain = float(grid.side_q[0]) ** 2  # the cells around hold everything as near as one side
+    found = _twentieth(points, row, near, n, distances)
+    local, n_local = near, n
+    if found > certain and rules.max_radius_mm > grid.side_q[0] * QUANTUM_MM:
+        if n_wide < 0:
+            wide, n_wide = _gather_wide(grid, cell, rules.max_radius_mm, wide)
+        found = _twentieth(points, row, wide, n_wide, distances)
+        local, n_local = wide, n_wide
+        grid.cell_needy[cell] = 1
+        grid.block_needy[grid.cell_block[cell]] = 1
+    if found > limit:
+        radius_mm = rules.max_radius_mm
+    else:
+        radius_mm = QUANTUM_MM * math.sqrt(found)
+        while math.floor((radius_mm / QUANTUM_MM) ** 2) < found:  # the root was rounded down
+            radius_mm *= 1.0 + 2.3e-16
+        radius_mm = min(max(radius_mm, rules.uncertainty_mm), rules.max_radius_mm)
+    if points[row].radius_mm != radius_mm:
+        points[row].radius_mm = radius_mm
+        points[row].changed_at = 0  # so that the new answer counts as another one
+    return local, n_local, wide, n_wide
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _twentieth(points, row, local, n, distances):
+    """Squared distance of the FLEXIBLE_POINTS-th nearest candidate, the point itself counted; inf when fewer."""
+    if n < FLEXIBLE_POINTS:
+        return math.inf
+    x, y, z = float(points[row].x), float(points[row].y), float(points[row].z)
+    squares = distances if n <= len(distances) else np.empty(n)
+    for k in range(n):
+        dx, dy, dz = local[0, k] - x, local[1, k] - y, local[2, k] - z
+        squares[k] = dx * dx + dy * dy + dz * dz
+    low, high = 0, n - 1
+    want = FLEXIBLE_POINTS - 1
+    while low < high:  # Hoare's selection
+        pivot = squares[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while squares[i] < pivot:
+                i += 1
+            while squares[j] > pivot:
+                j -= 1
+            if i <= j:
+                squares[i], squares[j] = squares[j], squares[i]
+                i += 1
+                j -= 1
+        if want <= j:
+            high = j
+        elif want >= i:
+            low = i
+        else:
+            break
+    return squares[want]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -335,7 +479,7 @@ def _gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules, sums, fits, i):
+def _grow(points, row, own, wide, n_wide, base_mm, limit_mm, is_exact, rules, sums, fits, i):
     """Grow the radius to the first step that makes the point reliable, leaving its sums and fit in column i.
 
     Returns the step; 0 when none does, and the column is as it was.
@@ -347,7 +491,7 @@ def _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules, sums, f
         step += 1
         radius_mm = min(base_mm * GROWTH**step, limit_mm)
         reach = math.floor((radius_mm / QUANTUM_MM) ** 2)
-        _put(sums, i, _sums_within(points, row, wide, n_wide, reach, is_exact))
+        _put(sums, i, _sums_within(points, row, own, wide, n_wide, reach, is_exact))
         _fit_one(sums, fits, i)
         if _reason_against(sums, fits, i, rules) == 0:
             return step
@@ -357,9 +501,9 @@ def _grow(points, row, wide, n_wide, base_mm, limit_mm, is_exact, rules, sums, f
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sums_within(points, row, local, n, reach, is_exact):
+def _sums_within(points, row, own, local, n, reach, is_exact):
     """The sums of `_sums`, exact for any radius."""
-    px, py, pz, own = points[row].x, points[row].y, points[row].z, points[row].line
+    px, py, pz = points[row].x, points[row].y, points[row].z
     if is_exact:
         sums = _sums(local, n, float(px), float(py), float(pz), float(own), float(reach))
         if sums[0] * reach < _EXACT:
@@ -443,17 +587,12 @@ def _sums_of_integers(local, n, px, py, pz, own, reach):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _store(points, row, sums, fits, i, reason, radius_mm, step, passes, laser_q, version):
+def _store(points, row, sums, fits, i, reason, radius_mm, step, passes, other_side, version):
     """Write an answer into the point's record; True when it differs from the one before."""
     count = np.int32(sums[0, i])
     ax, ay, az = fits[0, i], fits[1, i], fits[2, i]
     if reason:
         ax, ay, az = math.nan, math.nan, math.nan
-    else:
-        at = points[row].line
-        to_x, to_y = laser_q[at, 0] - points[row].x, laser_q[at, 1] - points[row].y
-        if ax * to_x + ay * to_y + az * (laser_q[at, 2] - points[row].z) < 0.0:  # Eq. 6.11
-            ax, ay, az = -ax, -ay, -az
     nx, ny, nz = np.float32(ax), np.float32(ay), np.float32(az)
     listed = points[row].open_passes & np.uint8(LISTED)
     same = (
@@ -461,6 +600,7 @@ def _store(points, row, sums, fits, i, reason, radius_mm, step, passes, laser_q,
         and points[row].neighbours == count
         and points[row].unreliable == reason
         and points[row].growth == step
+        and points[row].other_side == other_side
         and points[row].open_passes == passes | listed
         and (reason != 0 or (points[row].nx == nx and points[row].ny == ny and points[row].nz == nz))
     )
@@ -470,6 +610,7 @@ def _store(points, row, sums, fits, i, reason, radius_mm, step, passes, laser_q,
     points[row].neighbours = count
     points[row].unreliable = reason
     points[row].growth = step
+    points[row].other_side = other_side
     points[row].open_passes = passes | listed
     points[row].nx, points[row].ny, points[row].nz = nx, ny, nz
     points[row].middle_mm2 = fits[4, i] * to_mm2
@@ -480,12 +621,12 @@ def _store(points, row, sums, fits, i, reason, radius_mm, step, passes, laser_q,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _not_gone_by(bits, points, row, heading, front_q, max_radius_mm):
+def _not_gone_by(bits, points, row, heading, front_q, rules):
     """Of the passes in `bits`, those whose laser plane is not yet more than the point's r_max beyond it."""
     if bits == 0:
         return bits
     x, y, z = points[row].x, points[row].y, points[row].z
-    clearance_q = _radius_limit_mm(points[row].radius_mm, max_radius_mm) / QUANTUM_MM
+    clearance_q = _radius_limit_mm(points[row].radius_mm, rules) / QUANTUM_MM
     for slot in range(MAX_OPEN_PASSES):
         if bits & np.uint8(1 << slot):
             along = heading[slot, 0] * x + heading[slot, 1] * y + heading[slot, 2] * z
@@ -495,10 +636,9 @@ def _not_gone_by(bits, points, row, heading, front_q, max_radius_mm):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _passes_in_reach(points, row, local, n, reach, pass_bit):
-    """The bits of all open passes that have a point within reach."""
+def _passes_in_reach(points, row, bits, local, n, reach, pass_bit):
+    """`bits`, and those of all open passes that have a point within reach."""
     px, py, pz = np.int64(points[row].x), np.int64(points[row].y), np.int64(points[row].z)
-    bits = pass_bit[points[row].line]
     for k in range(n):
         bit = pass_bit[np.int64(local[3, k])]
         if bit & ~bits:
@@ -517,12 +657,12 @@ def settle_listed(
     Rows that still wait are moved to the front of `listed`. Of the others those that nothing else changed in this
     version go to `settled`. Returns how many wait, and how many went there.
     """
-    heading, front_q, max_radius_mm = lines.heading, lines.front_q, rules.max_radius_mm
+    heading, front_q = lines.heading, lines.front_q
     waiting = 0
     done = 0
     for i in range(len(listed)):
         row = listed[i]
-        bits = _not_gone_by(points[row].open_passes & ~np.uint8(LISTED), points, row, heading, front_q, max_radius_mm)
+        bits = _not_gone_by(points[row].open_passes & ~np.uint8(LISTED), points, row, heading, front_q, rules)
         if bits:
             points[row].open_passes = bits | np.uint8(LISTED)
             listed[waiting] = row
@@ -553,3 +693,22 @@ def drop_pass(listed: Int32Array, points: PointArray, bit: int) -> None:
     """Forget a closed pass at every listed row."""
     for row in listed:
         points[row].open_passes &= ~np.uint8(bit)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def flexible_radii_mm(rows: Int32Array, grid: Grid, points: PointArray, rules: Rules, radii: npt.NDArray[np.float64]):
+    """The flexible radius of each row, put into `radii` (m,); the points keep theirs."""
+    wide = np.empty((4, 512))
+    distances = np.empty(512)
+    side = grid.side_q[0]
+    limit = math.floor((rules.max_radius_mm / QUANTUM_MM) ** 2)
+    for i in range(len(rows)):
+        row = rows[i]
+        cell = cell_of(grid, points[row].x // side, points[row].y // side, points[row].z // side)
+        radii[i] = rules.max_radius_mm
+        if cell < 0:
+            continue
+        wide, n = _gather_wide(grid, cell, rules.max_radius_mm, wide)
+        found = _twentieth(points, row, wide, n, distances)
+        if found <= limit:
+            radii[i] = max(QUANTUM_MM * math.sqrt(found), rules.uncertainty_mm)

@@ -124,6 +124,11 @@ class PassBook:
         self._free.append(slot)
         return Pass(closed.number, slot, closed.normal)
 
+    def number_of(self, key: PassKey) -> int | None:
+        """The number of a pass, open or closed; None when it is unknown."""
+        known = self._passes.get(key)
+        return None if known is None else known.number
+
     def open_keys(self) -> list[PassKey]:
         """The passes that are open, in the order they were opened."""
         return [key for key, value in self._passes.items() if value.slot >= 0]

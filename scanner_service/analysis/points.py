@@ -13,7 +13,7 @@ POINT = np.dtype(
         ("x", np.int32),  # stored coordinates in quanta from the origin
         ("y", np.int32),
         ("z", np.int32),
-        ("line", np.int32),  # row of the scanline
+        ("other_side", np.int32),  # neighbours whose own ray comes from the other side of the plane
         ("radius_mm", np.float64),  # what the rule gave, before growing
         ("place", np.int32),  # place in the line
         ("neighbours", np.int32),  # Np, the point itself counted; 0: not counted
@@ -51,7 +51,7 @@ def reserve_points(max_points: int) -> PointArray:
 
 def used_radius_mm(points: PointArray, max_radius_mm: float) -> npt.NDArray[np.float64]:
     """(n,) radius that each point's answer was computed with, after growing; the kernel's own arithmetic."""
-    base = points["radius_mm"]
+    base = np.ascontiguousarray(points["radius_mm"])
     limit = np.maximum(base, np.minimum(max_radius_mm, GROWTH_REACH * base))
     grown: npt.NDArray[np.float64] = np.minimum(base * GROWTH ** points["growth"].astype(np.float64), limit)
     return grown
@@ -63,7 +63,6 @@ def write_points(
     first: int,
     xyz_q: Int32Array,
     place: Int32Array,
-    line: int,
     radius_mm: npt.NDArray[np.float64],
     rule: int,
     unreliable: int,
@@ -76,7 +75,7 @@ def write_points(
     for i in range(len(place)):
         point = points[first + i]
         point.x, point.y, point.z = xyz_q[i, 0], xyz_q[i, 1], xyz_q[i, 2]
-        point.line = line
+        point.other_side = 0
         point.place = place[i]
         point.radius_mm = radius_mm[i] if len(radius_mm) > 1 else radius_mm[0]
         point.neighbours = 0

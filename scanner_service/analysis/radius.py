@@ -3,6 +3,7 @@
 import hashlib
 import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,8 @@ from drivers.scanline import Float64Array
 from scanner_service.analysis.intake import QUANTUM_MM
 from scanner_service.analysis.snapshot import RadiusRule
 
+LiveRule = Literal["line", "flexible", "global"]
+
 MIN_GAPS = 10
 """A line's median point spacing is trusted from this many gaps on; below, the line spacing governs alone."""
 
@@ -21,18 +24,26 @@ MIN_GAPS = 10
 class RadiusSettings:
     """Which radius a scanline's points get.
 
-    `uncertainty_mm` is the constant c of Eq. 6.3 (0.1 mm by default). `point_spacing_mm` says how far apart the points
-    of a line are: None measures it in each line, a number states it for all, and 0 ignores it (plain Eq. 6.3).
+    `rule`: `line` is Eq. 6.3 with the governing spacing, `flexible` grows each point's radius until 20 points are
+    covered, `global` takes one radius for the whole cloud, the median of a 1 % sample. `uncertainty_mm` is the
+    constant c of Eq. 6.3 (0.1 mm by default), and where a flexible radius starts. `point_spacing_mm` says how far
+    apart the points of a line are: None measures it in each line, a number states it for all, and 0 ignores it (plain
+    Eq. 6.3).
     """
 
     uncertainty_mm: float = 0.1
     point_spacing_mm: float | None = None
+    rule: LiveRule = "line"
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.uncertainty_mm) and self.uncertainty_mm >= 0):
             raise ValueError(f"the constant c must be 0 mm or more, not {self.uncertainty_mm}")
         if self.point_spacing_mm is not None and not 0 <= self.point_spacing_mm < math.inf:
             raise ValueError(f"the point spacing must be 0 mm or more, not {self.point_spacing_mm}")
+        if self.rule not in get_args(LiveRule):
+            raise ValueError(f"the radius rule must be line, flexible or global, not {self.rule}")
+        if self.rule != "line" and not self.uncertainty_mm > 0:
+            raise ValueError("a radius that grows from c needs c greater than 0 mm")
 
 
 def point_spacing_mm(xyz_q: npt.NDArray[np.int32], index: npt.NDArray[np.int32]) -> float:

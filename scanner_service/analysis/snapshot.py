@@ -67,7 +67,9 @@ class MapSnapshot:
     """Every point of the live map at one version; arrays of n rows, part frame, millimetres.
 
     `line` is the row of the point's scanline in `lines`, `index` its place in that line. `neighbours` is Np of
-    Eq. 6.4, the point itself counted; 0 for points that are not counted. `density_per_mm2` = Np / (pi r^2).
+    Eq. 6.4, the point itself counted; 0 for points that are not counted. `same_side` leaves out those whose own ray
+    comes from the other side of the plane (a thin wall's back; equal to `neighbours` where no plane is known).
+    `density_per_mm2` = Np / (pi r^2).
     `normals` (n, 3) are unit, turned to the scanline's own laser position, NaN where `unreliable` is not 0.
     `offset` is |centroid - p| / r of the neighbourhood, 0 in the middle of a surface, about 0.42 at a straight border.
     `residual_mm` is sqrt(lambda3 / (Np - 3)), NaN below 4 points; `normal_error_rad` the predicted error or NaN.
@@ -81,6 +83,7 @@ class MapSnapshot:
     radius_mm: Float64Array
     radius_rule: UInt8Array
     neighbours: Int32Array
+    same_side: Int32Array
     density_per_mm2: Float64Array
     normals: Float64Array
     unreliable: UInt8Array
@@ -99,6 +102,18 @@ class MapSnapshot:
 
     def __len__(self) -> int:
         return len(self.points_mm)
+
+    @property
+    def side_density_per_mm2(self) -> Float64Array:
+        """(n,) density of the point's own side of a thin wall; what verdicts go by."""
+        density: Float64Array = self.same_side / (np.pi * self.radius_mm * self.radius_mm)
+        return density
+
+    @property
+    def unbiased_density_per_mm2(self) -> Float64Array:
+        """(n,) (Np - 1) / (pi r^2): under the flexible rule the 20th point set r, so it must not count."""
+        density: Float64Array = np.maximum(self.neighbours - 1, 0) / (np.pi * self.radius_mm * self.radius_mm)
+        return density
 
     @property
     def reliable(self) -> BoolArray:

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from drivers.scanline import Float64Array, Scanline
+from scanner_service.analysis.radius import LiveRule
 from scanner_service.sessions.settings import SessionSettings
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -50,6 +51,7 @@ class PushSourceIn(_Strict):
 class SettingsIn(_Strict):
     """Radius, reliability and requirement; everything may be left out."""
 
+    radius_rule: LiveRule = "line"
     uncertainty_mm: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.1
     point_spacing_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     noise_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
@@ -117,6 +119,14 @@ class ScanlineIn(_Strict):
             line_spacing_mm=self.line_spacing_mm,
             step_mm=math.nan if self.step_mm is None else self.step_mm,
         )
+
+
+class PassIn(_Strict):
+    """What names a pass within a session."""
+
+    device_id: Annotated[str, Field(min_length=1, max_length=200)]
+    boot_id: Annotated[int, Field(ge=0, lt=2**63)]
+    pass_index: Annotated[int, Field(ge=0, lt=2**31)]
 
 
 class ScanlinesIn(_Strict):

@@ -12,6 +12,7 @@ import numpy as np
 
 from drivers.scanline import Scanline
 from scanner_service.analysis.intake import StoredLine
+from scanner_service.analysis.passes import PassKey
 from scanner_service.analysis.warm_up import warm_up
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionBusy, SessionError
@@ -19,6 +20,7 @@ from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.sources import PushSource, Source
 from scanner_service.sessions.updates import Update, VerdictBook, update_since
+from scanner_service.sessions.withdrawals import WITHDRAWN, withdrawn_passes
 from scanner_service.storage.errors import RecordError
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import SessionRow, Stored
@@ -92,6 +94,8 @@ class LiveSession:
         ):
             self.engine.restore(line)
             on_progress(number)
+        for key in withdrawn_passes(self._record.events(self.row.session_id)):
+            self.engine.live_map.withdraw_pass(key)
         if damaged:
             self._message = f"{len(damaged)} stored lines are damaged and left out; the first: {damaged[0]}"
         if self._state in ("stopped", "failed", "interrupted"):
@@ -137,6 +141,17 @@ class LiveSession:
         reply: Future[Stored] = Future()
         self.engine.put(line, reply)
         return reply
+
+    def withdraw_pass(self, key: PassKey) -> int:
+        """Take a pass out of the map; the raw lines and the withdrawal itself stay in the record.
+
+        Returns how many points that were; 0, and nothing recorded, when the pass is unknown or withdrawn already.
+        """
+        count = self.engine.ask(lambda engine: engine.live_map.withdraw_pass(key)).result()
+        if count:
+            self._event(WITHDRAWN, {"device_id": key[0], "boot_id": key[1], "pass_index": key[2], "points": count})
+            self._judge()
+        return count
 
     def stop(self) -> None:
         """End the scan: close the source and the passes, judge what there is; idempotent."""

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from scanner_service.analysis.live_map import MapSettings
-from scanner_service.analysis.radius import RadiusSettings
+from scanner_service.analysis.radius import LiveRule, RadiusSettings
 from scanner_service.rescan.requirement import Requirement
 
 
@@ -14,11 +14,12 @@ from scanner_service.rescan.requirement import Requirement
 class SessionSettings:
     """Radius, reliability and requirement of one session; kept in the record as a JSON object.
 
-    `uncertainty_mm` is c of Eq. 6.3; `point_spacing_mm` None measures it line by line, a number states it, 0 ignores
+    `radius_rule` is `line`, `flexible` or `global`. `uncertainty_mm` is c of Eq. 6.3; `point_spacing_mm` None measures it line by line, a number states it, 0 ignores
     it. `noise_mm` is one standard deviation of the scanner. `density_per_mm2` is the required density, None for half
     of 1 / (line spacing * point spacing).
     """
 
+    radius_rule: LiveRule = "line"
     uncertainty_mm: float = 0.1
     point_spacing_mm: float | None = None
     noise_mm: float = 0.01
@@ -34,7 +35,7 @@ class SessionSettings:
     def map_settings(self) -> MapSettings:
         """The part that the live map is told."""
         return MapSettings(
-            radius=RadiusSettings(self.uncertainty_mm, self.point_spacing_mm),
+            radius=RadiusSettings(self.uncertainty_mm, self.point_spacing_mm, self.radius_rule),
             noise_mm=self.noise_mm,
             max_normal_error_rad=self.max_normal_error_rad,
             max_points=self.max_points,

@@ -7,8 +7,10 @@ from typing import Any
 
 from drivers.rig import Rig
 from drivers.scanners.native import NativeScanner
+from scanner_service.analysis.passes import pass_key
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.sources import DeviceSource, PassRequest, PushSource, ReplaySource, Source
+from scanner_service.sessions.withdrawals import withdrawn_passes
 from scanner_service.storage.formats import ReadOptions, Recording, open_recording
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.rows import SessionRow
@@ -97,8 +99,9 @@ class RecordSpec:
         return cls(reader, newest[0], speed)
 
     def open(self) -> Source:
-        """A source that plays the stored lines as they are."""
-        lines = (line for _, line in self.reader.lines(self.session.session_id))
+        """A source that plays the stored lines as they are, without the passes that were withdrawn."""
+        gone = withdrawn_passes(self.reader.events(self.session.session_id))
+        lines = (line for _, line in self.reader.lines(self.session.session_id) if pass_key(line) not in gone)
         return ReplaySource(lines, self.reader.count(self.session.session_id).lines, None, self.speed)
 
     def to_dict(self) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from starlette.responses import Response
 
 from scanner_service.api.answers import answer
 from scanner_service.api.keys import Role
-from scanner_service.api.schemas import DeviceSourceIn, PushSourceIn, ReplaySourceIn, SessionIn
+from scanner_service.api.schemas import DeviceSourceIn, PassIn, PushSourceIn, ReplaySourceIn, SessionIn
 from scanner_service.api.scopes import require
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.session import LiveSession
@@ -126,6 +126,13 @@ def stop_session(session: Session) -> Response:
     """Stop the scan, close its passes and judge it; the answer comes when the verdict is there."""
     session.stop()
     return answer(status_answer(session))
+
+
+@router.post("/{session_id}/passes/withdraw", dependencies=[operator])
+def withdraw_pass(session: Session, body: PassIn) -> Response:
+    """Take a pass out of the map, as if it had never been scanned. Its raw lines stay in the record."""
+    points = session.withdraw_pass((body.device_id, body.boot_id, body.pass_index))
+    return answer({"points": points, **status_answer(session)})
 
 
 @router.delete("/{session_id}", status_code=204, dependencies=[admin])

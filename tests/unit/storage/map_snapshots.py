@@ -48,6 +48,7 @@ def plate(lines=12, points=15, spacing_mm=0.25, seed=1) -> MapSnapshot:
         radius_mm=radius,
         radius_rule=np.zeros(n, np.uint8),
         neighbours=neighbours,
+        same_side=neighbours,
         density_per_mm2=neighbours / (np.pi * radius**2),
         normals=normals,
         unreliable=unreliable,
