@@ -4,14 +4,12 @@ import asyncio
 import contextlib
 import io
 import json
-import os
 import re
-import shutil
 import socket
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,10 +25,9 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from scanner_service.web import CONTENT_SECURITY_POLICY, INDEX_HTML, STATIC_DIR
+from tests.end_to_end.browsing import NEEDS_CHROMIUM, Page, chromium, wait
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
+pytestmark = NEEDS_CHROMIUM
 
 ORIGIN_MM = np.array([100.0, 50.0, 20.0])
 SPARSE_PER_MM2, DENSE_PER_MM2 = 3.0, 18.0
@@ -263,21 +260,10 @@ class Host:
         self.thread.join(10)
 
 
-def wait(condition: Callable[[], bool], seconds: float = 20) -> None:
-    """Until the condition holds; fails loudly when it never does."""
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
-
-
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    flags = ["--enable-unsafe-swiftshader"] + (["--no-sandbox"] if os.geteuid() == 0 else [])
-    with playwright.sync_playwright() as run:
-        chromium = run.chromium.launch(executable_path=CHROMIUM, args=flags)
-        yield chromium
-        chromium.close()
+    with chromium() as made:
+        yield made
 
 
 @pytest.fixture
@@ -292,45 +278,22 @@ def host(service: StandIn) -> Iterator[Host]:
     made.stop()
 
 
-@dataclass
-class Page:
-    """A tab and what it complained of."""
-
-    tab: Any
-    complaints: list[str]
-
-    def number(self, name: str) -> Any:
-        return self.tab.evaluate(f"viewer.{name}")
-
-    def until(self, expression: str) -> None:
-        wait(lambda: bool(self.tab.evaluate(expression)))  # not wait_for_function: the page's policy forbids its eval
-
-    def whole(self, host: Host) -> None:
-        """Until every point has arrived and the regions are listed."""
-        self.until(f"viewer.points === {len(host.service.cloud.xyz)} && viewer.regions === 2")
-
-
 @pytest.fixture
 def page(browser: Any, host: Host) -> Iterator[Page]:
-    tab = browser.new_page(viewport={"width": 1280, "height": 800})
-    made = Page(tab, [])
-    tab.on("console", lambda entry: made.complaints.append(entry.text) if entry.type in {"error", "warning"} else None)
-    tab.on("pageerror", lambda error: made.complaints.append(str(error)))
-    tab.on("request", lambda sent: sent.url.startswith((host.url, "ws://127")) or made.complaints.append(sent.url))
-    tab.goto(host.url)
+    made = Page.opened(browser, host.url, f"127.0.0.1:{host.port}", calm=True)
     yield made
-    tab.close()
+    made.tab.close()
 
 
-def settle(page: Page) -> None:
-    """Until the camera has arrived where it was sent."""
-    page.until("!viewer.flying")
+def all_arrived(page: Page, host: Host) -> None:
+    """Until every point has arrived and the regions are listed."""
+    page.until(f"viewer.points === {len(host.service.cloud.xyz)} && viewer.regions === 2")
 
 
 def test_the_newest_live_session_opens_by_itself_and_every_point_arrives_without_a_complaint(
     page: Page, host: Host
 ) -> None:
-    page.whole(host)
+    all_arrived(page, host)
     assert page.number("session") == "s-1"
     assert page.tab.text_content("#session-state") == "scanning"
     assert page.tab.text_content("#connection-text") == "Live"
@@ -341,17 +304,12 @@ def test_the_newest_live_session_opens_by_itself_and_every_point_arrives_without
     assert re.search(r"No return \S+ % 214 In a piece that never arrived \S+ % 64 Scanlines", told), told
     assert re.search(r"Refused: invalid \S+ % 2 None: on the way to the record, duplicates, conflicts", told), told
     assert [page.tab.text_content(f"#regions li:nth-child({i}) .reason") for i in (1, 2)] == ["Sparse", "Steep"]
-    assert complaints_of(page) == []
+    assert page.complaints == []
     assert host.service.overdrawn == 0
 
 
-def complaints_of(page: Page) -> list[str]:
-    """All but the software renderer's own remarks on reading pixels."""
-    return [text for text in page.complaints if "GPU stall" not in text and "GL Driver Message" not in text]
-
-
 def test_a_change_of_few_rows_uploads_few_rows(page: Page, host: Host) -> None:
-    page.whole(host)
+    all_arrived(page, host)
     page.until("document.querySelector('#legend').hidden === false")
     before, version = page.number("uploadedRows"), page.number("version")
     host.service.touch = [5, 9, 20000]
@@ -362,7 +320,7 @@ def test_a_change_of_few_rows_uploads_few_rows(page: Page, host: Host) -> None:
 
 
 def test_a_lost_service_is_said_and_found_again_with_the_whole_map(page: Page, host: Host) -> None:
-    page.whole(host)
+    all_arrived(page, host)
     host.stop()
     page.until("viewer.connection === 'waiting'")
     page.until("document.querySelector('#connection-text').textContent.startsWith('Connection lost. Trying again in')")
@@ -370,7 +328,7 @@ def test_a_lost_service_is_said_and_found_again_with_the_whole_map(page: Page, h
     assert page.number("points") == len(host.service.cloud.xyz)  # what is known stays in sight
     host.start()
     page.until("viewer.connection === 'open'")
-    page.whole(host)
+    all_arrived(page, host)
     page.until("document.querySelector('#message').hidden")
     assert host.service.snapshots == 2
 
@@ -379,36 +337,37 @@ def test_an_update_that_does_not_follow_makes_the_page_ask_for_everything_again(
     host.service.gap = True
     tab = browser.new_page()
     tab.goto(host.url)
-    Page(tab, []).whole(host)
+    all_arrived(Page(tab, []), host)
     assert host.service.snapshots == 2
     tab.close()
 
 
 def test_keys_choose_front_right_and_top_views_and_fit(page: Page, host: Host) -> None:
-    page.whole(host)
-    settle(page)
+    all_arrived(page, host)
+    page.until("document.querySelector('#legend').hidden === false")
+    page.settle()
     for key, axis, sign in (("1", 1, -1), ("3", 0, 1), ("7", 2, 1)):
         page.tab.keyboard.press(key)
-        settle(page)
+        page.settle()
         arm = np.array(page.number("eye")) - np.array(page.number("target"))
         assert sign * arm[axis] > 0.999 * np.linalg.norm(arm)
     page.tab.keyboard.press("+")
     page.tab.keyboard.press("-")
     page.tab.keyboard.press("+")
     page.tab.keyboard.press("+")
-    settle(page)
+    page.settle()
     near = np.linalg.norm(np.array(page.number("eye")) - np.array(page.number("target")))
     page.tab.keyboard.press("f")
-    settle(page)
+    page.settle()
     far = np.linalg.norm(np.array(page.number("eye")) - np.array(page.number("target")))
-    assert far > 1.5 * near  # the steps add up, however fast they follow each other
+    assert far > 1.5 * near
 
 
 def test_a_click_tells_coordinates_in_the_part_frame_that_lie_on_the_surface(page: Page, host: Host) -> None:
-    page.whole(host)
+    all_arrived(page, host)
     page.until("document.querySelector('#legend').hidden === false")
     page.tab.keyboard.press("7")
-    settle(page)
+    page.settle()
     frame = page.tab.locator("#canvas").bounding_box()
     page.tab.mouse.click(frame["x"] + 0.55 * frame["width"], frame["y"] + 0.6 * frame["height"])
     page.until("viewer.inspected >= 0")
@@ -422,9 +381,9 @@ def test_a_click_tells_coordinates_in_the_part_frame_that_lie_on_the_surface(pag
 
 
 def test_choosing_a_region_turns_the_view_about_it_and_names_its_remedy(page: Page, host: Host) -> None:
-    page.whole(host)
+    all_arrived(page, host)
     page.tab.click("#regions button:has-text('Steep')")
-    settle(page)
+    page.settle()
     steep = np.array(REGIONS[0]["centroid_mm"]) - ORIGIN_MM
     assert np.allclose(page.number("target"), steep, atol=1e-6)
     assert page.tab.get_attribute("#regions button:has-text('Steep')", "aria-pressed") == "true"
@@ -433,7 +392,7 @@ def test_choosing_a_region_turns_the_view_about_it_and_names_its_remedy(page: Pa
 
 
 def test_blue_is_dense_red_is_sparse_and_grey_is_unreliable(page: Page, host: Host) -> None:
-    page.whole(host)
+    all_arrived(page, host)
     page.until("document.querySelector('#legend').hidden === false")
     page.tab.select_option("#scale", "bgyr")
     page.tab.click("summary:has-text('Display')")
@@ -443,7 +402,7 @@ def test_blue_is_dense_red_is_sparse_and_grey_is_unreliable(page: Page, host: Ho
     page.tab.mouse.click(400, 700)
     page.tab.keyboard.press("Escape")
     page.tab.keyboard.press("7")
-    settle(page)
+    page.settle()
     dense, sparse, unreliable = (colour_at(page, x, y) for x, y in ((0, -20), (20, 8), (-22, -12)))
     assert dense[2] > dense[0] + 60
     assert sparse[0] > sparse[2] + 60
@@ -467,14 +426,14 @@ def colour_at(page: Page, x: float, y: float) -> tuple[int, ...]:
 
 
 def test_a_refused_command_is_told_in_the_service_s_own_words(page: Page, host: Host) -> None:
-    page.whole(host)
+    all_arrived(page, host)
     page.tab.click("#stop")
     page.until("document.querySelector('#message').textContent === 'the stage is still moving'")
     assert host.service.commands == ["stop"]
 
 
 def test_the_list_offers_every_session_and_the_address_names_the_one_that_is_open(page: Page, host: Host) -> None:
-    page.whole(host)
+    all_arrived(page, host)
     page.tab.keyboard.press("s")
     page.tab.wait_for_selector("#session-list button")
     assert page.tab.locator("#session-list .name").all_text_contents() == ["Bracket 4711, left", "Bracket, first try"]

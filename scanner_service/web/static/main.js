@@ -332,6 +332,7 @@ globalThis.viewer = Object.freeze({
   get capacity() { return session.store.capacity; },
   get uploadedRows() { return cloud.uploadedRows; },
   get regions() { return session.regions?.length ?? 0; },
+  get outlined() { return overlay.outlined; },
   get connection() { return connectionState; },
   get flying() { return view.flight !== null; },
   get frames() { return frames; },

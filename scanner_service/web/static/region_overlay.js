@@ -17,6 +17,11 @@ export class RegionOverlay {
     this.shown = true;
   }
 
+  // The numbers of the regions whose outline is in the picture.
+  get outlined() {
+    return this.shown ? this.items.filter(({ front }) => front.visible).map(({ region }) => region.number) : [];
+  }
+
   set visible(on) {
     this.shown = on;
     this.group.visible = on;

@@ -6,7 +6,7 @@ import { drawSessions, sessionDetail } from "./panels.js";
 import { listSessions } from "./service.js";
 import { OVER } from "./session_view.js";
 
-const RETRY_MS = 3000;
+const RETRY_MS = 1000;
 
 const newestFirst = (sessions) => [...sessions].sort((a, b) => new Date(b.created ?? 0) - new Date(a.created ?? 0));
 

@@ -1,0 +1,209 @@
+"""The viewer in a real browser before the real service: simulator process, pty, driver, service, WebSocket, page."""
+
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from tests.end_to_end.browsing import NEEDS_CHROMIUM, Page, chromium, wait
+from tests.end_to_end.running import ROOT
+
+pytestmark = NEEDS_CHROMIUM
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as made:
+        yield made
+
+
+@pytest.fixture
+def context(browser: Any) -> Iterator[Any]:
+    """A browser that nobody has signed in with."""
+    made = browser.new_context()
+    yield made
+    made.close()
+
+
+def device(simulator: Any, **changes: Any) -> dict[str, Any]:
+    first_mm, last_mm = simulator.ready["travel_mm"]
+    source = {"kind": "device", "port": simulator.port, "baud_rate": 3_000_000, "line_rate_hz": 60.0}
+    return source | {"line_spacing_mm": 0.25, "start_mm": first_mm, "end_mm": last_mm} | changes
+
+
+def viewer_page(context: Any, service: Any) -> Page:
+    return Page.opened(context, service.viewer, urlsplit(service.url).netloc)
+
+
+def regions_of(service: Any, session_id: str) -> list[dict[str, Any]]:
+    regions: list[dict[str, Any]] = service.client.get(f"/api/v1/sessions/{session_id}/regions").json()["regions"]
+    return regions
+
+
+def points_of(service: Any, session_id: str) -> dict[str, np.ndarray]:
+    """Every point as REST tells it."""
+    pages: list[dict[str, Any]] = []
+    start: int | None = 0
+    while start is not None:
+        query = {"start": start, "limit": 10_000}
+        pages.append(service.client.get(f"/api/v1/sessions/{session_id}/points", params=query).json())
+        start = pages[-1]["next"]
+    return {
+        name: np.concatenate([np.array(page[name], dtype=np.float64) for page in pages])
+        for name in ("points_mm", "density_per_mm2")
+    }
+
+
+def test_a_live_scan_is_seen_growing_and_ends_as_the_service_has_it(running: Any, context: Any) -> None:
+    service, simulator = running.service(), running.simulator("step")
+    page = viewer_page(context, service)
+    page.until("document.querySelector('#notice').textContent.startsWith('No session yet')")
+    session_id = service.create(**device(simulator, line_rate_hz=30.0))
+    service.start(session_id)
+    page.until(f"viewer.session === '{session_id}'")
+
+    seen, states = [], []
+
+    def is_finished() -> bool:
+        seen.append(page.number("points"))
+        states.append(page.text("#session-state"))
+        return bool(page.number("connection") == "finished")
+
+    wait(is_finished, seconds=40)
+    assert seen == sorted(seen)
+    assert len(set(seen)) > 5, "the cloud did not grow before the eyes"
+    assert list(dict.fromkeys(state for state in states if state)) == ["scanning", "stopped"]
+    assert page.text("#connection-text") == "Finished"
+
+    known = points_of(service, session_id)
+    assert page.number("points") == page.number("total") == len(known["points_mm"])
+    regions = regions_of(service, session_id)
+    assert {region["reason"] for region in regions} >= {"shadow"}
+    listed = [int(number) for number in page.tab.locator("#regions .number").all_text_contents()]
+    assert listed == [region["number"] for region in regions], "the most urgent first, as the service has them"
+    reasons = [text.lower() for text in page.tab.locator("#regions .reason").all_text_contents()]
+    assert reasons == [region["reason"].replace("_", " ") for region in regions]
+    assert sorted(page.number("outlined")) == sorted(listed)
+    assert page.text("#losses-count") == "nothing lost"
+
+    page.tab.click("summary:has-text('Display')")
+    page.tab.uncheck("#shaded")
+    page.tab.uncheck("#show-regions")
+    page.tab.fill("#point-size", "2")
+    page.tab.keyboard.press("Escape")
+    page.tab.click("#session-state")
+    page.tab.keyboard.press("7")
+    page.settle()
+    for place in ((0.0, 8.0), (0.0, 34.0)):  # below and on the step
+        assert_coloured_by_density(page, known, *place)
+    assert page.complaints == []
+    page.tab.close()
+
+
+def assert_coloured_by_density(page: Page, known: dict[str, np.ndarray], x_mm: float, y_mm: float) -> None:
+    """The commonest colour around a place, seen from the top, is the one that viridis has for the densities there."""
+    points, density = known["points_mm"], known["density_per_mm2"]
+    near = np.hypot(points[:, 0] - x_mm, points[:, 1] - y_mm) < 1.5
+    assert near.sum() > 50
+    eye, middle, (low, high) = (page.number(name) for name in ("eye", "middle", "densityRange"))
+    frame = page.tab.locator("#canvas").bounding_box()
+    px_per_mm = frame["height"] / (2 * (eye[2] - np.median(points[near, 2])) * np.tan(np.radians(16)))
+    x = frame["x"] + middle[0] + (x_mm - eye[0]) * px_per_mm
+    y = frame["y"] + middle[1] - (y_mm - eye[1]) * px_per_mm
+    picture = page.tab.screenshot(clip={"x": x - 8, "y": y - 8, "width": 16, "height": 16})
+    pixels = imread(io.BytesIO(picture), format="png")[..., :3].reshape(-1, 3)
+    shares = (np.quantile(density[near], [0.02, 0.98]) - low) / (high - low)
+    expected = mpl.colormaps["viridis"](np.linspace(*shares, 50))[:, :3]
+    distances = np.abs(pixels[:, None, :] - expected[None, :, :]).max(axis=2).min(axis=1)
+    assert np.median(distances) < 0.03, f"{np.median(pixels, axis=0)} at densities {shares} of the range"
+    assert high > density.max() / 2 > 0
+
+
+def test_the_page_says_that_the_scanner_is_gone_and_stops_the_scan_when_it_is_back(
+    running: Any, context: Any, tmp_path: Path
+) -> None:
+    link = tmp_path / "scanner-port"
+    service, simulator = running.service(), running.simulator("step", "--link", link)
+    session_id = service.create(**device(simulator, port=str(link), line_rate_hz=20.0))
+    service.start(session_id)
+    page = viewer_page(context, service)
+    page.until("viewer.points > 1000")
+    assert (page.text("#session-state"), page.text("#start"), page.text("#notice")) == ("scanning", "", "")
+
+    simulator.tell("unplug")
+    page.until("document.querySelector('#session-state').textContent === 'paused'")
+    assert "waiting for it to return" in page.text("#message")
+    picture, banner = (page.tab.locator(name).bounding_box() for name in ("#view", "#message"))
+    assert picture["y"] < banner["y"] < picture["y"] + picture["height"] / 4, "the message stands above the picture"
+    simulator.tell("replug")
+    page.until("document.querySelector('#message').hidden")
+
+    page.tab.click("#stop")
+    page.until("viewer.connection === 'finished'")
+    status = service.status(session_id)
+    assert (status["state"], page.text("#session-state")) == ("stopped", "stopped")
+    assert page.number("points") == status["points"]
+    assert 0 < status["progress"] < 1
+    assert (page.text("#stop"), page.text("#start")) == ("", ""), "a device's session is scanned once"
+    assert page.complaints == []
+    page.tab.close()
+
+
+def pushed_lines(count: int) -> list[dict[str, Any]]:
+    return [
+        {
+            "line_index": i,
+            "points_mm": [[0.15 * k, 0.2 * i, 0.0] for k in range(40)],
+            "laser_mm": [3.0, 0.2 * i, 100.0],
+            "plane_normal": [0, 1, 0],
+            "travel": [0, 1, 0],
+            "line_spacing_mm": 0.2,
+        }
+        for i in range(count)
+    ]
+
+
+def test_the_page_starts_a_session_misses_a_service_that_ends_and_finds_it_again(running: Any, context: Any) -> None:
+    service = running.service()
+    session_id = service.create(kind="push")
+    page = viewer_page(context, service)
+    page.until("!document.querySelector('#start').hidden")
+    assert (page.text("#notice"), page.text("#stop")) == ("Not scanning. Start begins the scan.", "")
+    page.tab.click("#start")
+    page.until("document.querySelector('#session-state').textContent === 'scanning'")
+    url = f"/api/v1/sessions/{session_id}/scanlines"
+    assert service.client.post(url, json={"lines": pushed_lines(20)}).status_code == 200
+    page.until("viewer.points === 800")
+
+    service.kill()
+    page.until("viewer.connection === 'waiting'")
+    page.until("document.querySelector('#message').textContent.includes('does not answer')")
+    assert page.text("#connection-text").startswith("Connection lost. Trying again in")
+    assert page.number("points") == 800, "what is known stays in sight"
+
+    command = [sys.executable, "-m", "scanner_service", "serve", "--json", "--data", str(running.data)]
+    port = str(urlsplit(service.url).port)
+    with subprocess.Popen([*command, "--port", port], stdout=subprocess.PIPE, text=True, cwd=ROOT) as again:
+        try:
+            viewer = json.loads(again.stdout.readline())["viewer"]  # type: ignore[union-attr]
+            page.tab.click("#retry")
+            page.until("document.querySelector('#message').textContent.startsWith('Not signed in')")
+            elsewhere = Page.opened(context, viewer, urlsplit(service.url).netloc)  # logins end with the process
+            page.tab.bring_to_front()
+            page.until("viewer.connection === 'open' && viewer.points === 800")
+            page.until("document.querySelector('#session-state').textContent === 'interrupted'")
+            page.until("document.querySelector('#message').hidden")
+            assert page.text("#start") == "Go on"
+            assert elsewhere.complaints == []
+        finally:
+            again.terminate()
+    page.tab.close()
