@@ -7,6 +7,7 @@ import numpy.typing as npt
 from numba import njit
 
 _CLOSE = 1e-15
+_THIRD = 0.34  # the smallest of three moments is at most a third of their sum
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -45,7 +46,7 @@ def smallest_axis(
         if abs(step) <= _CLOSE + 1e-12 * small:
             climbs = True
             break
-    if not climbs:
+    if not climbs or small > _THIRD:  # rounding noise at the start of a line of points can throw it anywhere
         small = _smallest_root(a, b, c, d, e, f)
     small = max(small, 0.0)
     rest = 1.0 - small
@@ -113,7 +114,7 @@ def fit_planes(sums: npt.NDArray[np.float64], n: int, fits: npt.NDArray[np.float
             step = (w - small * (q + small * (small - 1.0))) / (slope if slope > 1e-300 else 1e-300)
             small += step
         near = _CLOSE + 1e-12 * small
-        has_arrived = trace > 0.0 and step <= near and step >= -near and small < 0.34
+        has_arrived = trace > 0.0 and step <= near and step >= -near and small < _THIRD
         small = small if small > 0.0 else 0.0
         rest = 1.0 - small
         spread = rest * rest - 4.0 * (q - small * rest)

@@ -14,9 +14,9 @@ from scanner_service.rescan.requirement import Requirement
 class SessionSettings:
     """Radius, reliability and requirement of one session; kept in the record as a JSON object.
 
-    `radius_rule` is `line`, `flexible` or `global`. `uncertainty_mm` is c of Eq. 6.3; `point_spacing_mm` None measures it line by line, a number states it, 0 ignores
-    it. `noise_mm` is one standard deviation of the scanner. `density_per_mm2` is the required density, None for half
-    of 1 / (line spacing * point spacing).
+    `radius_rule` is `line`, `flexible` or `global`; `uncertainty_mm` is c of Eq. 6.3. `point_spacing_mm` None measures
+    it line by line, a number states it, 0 ignores it. `noise_mm` is one standard deviation of the scanner.
+    `density_per_mm2` is the required density, None for half of 1 / (line spacing * point spacing).
     """
 
     radius_rule: LiveRule = "line"
