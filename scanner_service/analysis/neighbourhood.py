@@ -324,30 +324,42 @@ def _twentieth(points, row, local, n, distances):
         return math.inf
     x, y, z = float(points[row].x), float(points[row].y), float(points[row].z)
     squares = distances if n <= len(distances) else np.empty(n)
+    highest = 0.0
     for k in range(n):
         dx, dy, dz = local[0, k] - x, local[1, k] - y, local[2, k] - z
         squares[k] = dx * dx + dy * dy + dz * dz
-    low, high = 0, n - 1
-    want = FLEXIBLE_POINTS - 1
-    while low < high:  # Hoare's selection
-        pivot = squares[(low + high) // 2]
-        i, j = low, high
-        while i <= j:
-            while squares[i] < pivot:
-                i += 1
-            while squares[j] > pivot:
-                j -= 1
-            if i <= j:
-                squares[i], squares[j] = squares[j], squares[i]
-                i += 1
-                j -= 1
-        if want <= j:
-            high = j
-        elif want >= i:
-            low = i
+        highest = max(highest, squares[k])
+    # Narrow an interval until it holds the answer alone; counting runs in vector registers, sorting would not. On a
+    # surface the count grows with the square of the distance, so interpolation nearly hits it; every other step halves.
+    low, high = -1.0, highest  # count(<= low) < 20 <= count(<= high)
+    count_low, count_high = 0.0, float(n)
+    halve = False
+    while high - low > 1.0:
+        share = 0.5 if halve else (FLEXIBLE_POINTS - 0.5 - count_low) / (count_high - count_low)
+        middle = min(max(math.floor(low + share * (high - low)), low + 1.0), high - 1.0)
+        count, below = _count_up_to(squares, n, middle)
+        if count == FLEXIBLE_POINTS:
+            return below
+        if count < FLEXIBLE_POINTS:
+            low, count_low = middle, count
         else:
-            break
-    return squares[want]
+            high, count_high = middle, count
+        halve = not halve
+    return high  # several points are equally far
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "nnan"})
+def _count_up_to(squares, n, limit):
+    """How many of the first n values are at most `limit`; when that is FLEXIBLE_POINTS, also the largest of these."""
+    count = 0.0
+    for k in range(n):
+        count += 1.0 if squares[k] <= limit else 0.0
+    largest = -1.0
+    if count == FLEXIBLE_POINTS:
+        for k in range(n):
+            value = squares[k] if squares[k] <= limit else -1.0
+            largest = max(largest, value)
+    return count, largest
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

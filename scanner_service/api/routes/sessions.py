@@ -132,7 +132,7 @@ def stop_session(session: Session) -> Response:
 def withdraw_pass(session: Session, body: PassIn) -> Response:
     """Take a pass out of the map, as if it had never been scanned. Its raw lines stay in the record."""
     points = session.withdraw_pass((body.device_id, body.boot_id, body.pass_index))
-    return answer({"points": points, **status_answer(session)})
+    return answer({**status_answer(session), "withdrawn_points": points})
 
 
 @router.delete("/{session_id}", status_code=204, dependencies=[admin])
