@@ -78,7 +78,7 @@ def observed_coverage(snapshot: MapSnapshot, report: RegionReport, cell_mm: floa
     if cell_mm is not None and not (np.isfinite(cell_mm) and cell_mm > 0):
         raise ValueError(f"cell_mm must be greater than 0 mm, not {cell_mm}")
     judgement, strips = report.judgement, report.strips
-    gap_mm2 = sum(region.area_mm2 for region in report.regions if region.reason is Reason.SHADOW)
+    gap_mm2 = report.gap_mm2
     rows = np.flatnonzero(judgement.judged)
     if not len(rows):
         none = np.zeros(0)

@@ -7,13 +7,13 @@ of the fan in the scanlines of a pass. Between the two ends A and B of such a pa
   neighbourhood radius, AB is closer to the ray than to its perpendicular, and neither end's tangent plane leads to the
   other end. A camera's shadow runs along the camera's ray, at the triangulation angle (20-40°) to the laser's; the
   laser's shadow runs along the laser's ray;
-- a *flank*: the same, but three pairs or more in a row jump in the same sense, or neither end has a plane: steep
-  surface;
+- a *flank*: the same, but three pairs or more in a row jump in the same sense, or neither end has a plane, or the plane
+  of one leads to the other: steep surface;
 - *filled*: a shadow of one pass, about whose middle another pass has points;
 - *out of range*: both ends stand near an end of the measurement range;
-- a *hole*: anything else. An inner border of the part, or dropouts: not a reason by itself.
-
-A slot so narrow that no return comes from its bottom anywhere looks exactly like a slot through the part.
+- a *hole*: anything else. An inner border of the part, or dropouts: not a reason by itself. So is a jump over places
+  without a return to a lone return from which the surface rises again at once: the far wall of a hole; and, without
+  a geometry, to a lower end without a sure plane or that the ray grazes: the silhouette of something behind.
 """
 
 from dataclasses import dataclass
@@ -24,11 +24,15 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
-from scanner_service.analysis.snapshot import MapSnapshot, UInt8Array
+from scanner_service.analysis.snapshot import MapSnapshot, RadiusRule, UInt8Array
 from scanner_service.rescan.stations import IntArray, Stations
-from scanner_service.rescan.strips import Strips
+from scanner_service.rescan.strips import Strips, in_a_row
+
+Pairs = tuple[IntArray, IntArray, Float64Array, IntArray]  # first and second rows, width_mm, lane
 
 _LEAST_SPACINGS = 3.0
+_LOST = 3  # places without a return that are more than chance
+_FACING = 0.5  # cosine of the largest incidence at the foot of a shadow
 _RANGE_SHARE = 0.005  # share of the range within which a point is near its end, whatever the surface does
 
 
@@ -48,7 +52,8 @@ class Gaps:
 
     `high` and `low` (g,) are rows of the snapshot, `high` nearer to the laser. `across` (g,) is True where the gap
     lies across the scanlines (along the travel), False along one line. `width_mm` (g,) is the spacing of such gaps
-    beside each other: the ray spacing for gaps across, the line stride for gaps along the line.
+    beside each other: the ray spacing for gaps across, the line stride for gaps along the line. `lane` (g,) counts
+    them beside each other within a pass: the ray for gaps across, the place of the scanline for gaps along the line.
     """
 
     high: IntArray
@@ -56,9 +61,10 @@ class Gaps:
     across: BoolArray
     width_mm: Float64Array
     kind: UInt8Array
+    lane: IntArray
 
     def __post_init__(self) -> None:
-        for array in (self.high, self.low, self.across, self.width_mm, self.kind):
+        for array in (self.high, self.low, self.across, self.width_mm, self.kind, self.lane):
             read_only(array)
 
     def __len__(self) -> int:
@@ -67,6 +73,12 @@ class Gaps:
     def of_kind(self, kind: GapKind) -> npt.NDArray[np.intp]:
         """Rows of the gaps of one kind."""
         return np.flatnonzero(self.kind == kind)
+
+
+def gap_lengths_mm(snapshot: MapSnapshot, gaps: Gaps, rows: npt.NDArray[np.intp]) -> Float64Array:
+    """(k,) distance between the ends of some gaps."""
+    vector = snapshot.points_mm[gaps.high[rows]] - snapshot.points_mm[gaps.low[rows]]
+    return np.asarray(np.linalg.norm(vector, axis=1), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +130,8 @@ def find_gaps(
     """All gaps between settled points, classified."""
     pairs = [_pairs_along(snapshot, stations, strips), _pairs_across(snapshot, stations, strips, fan)]
     parts = [
-        _classified(snapshot, stations, strips, fan, geometry, first, second, width, across)
-        for (first, second, width), across in zip(pairs, (False, True), strict=True)
+        _classified(snapshot, stations, strips, fan, geometry, first, second, width, lane, across)
+        for (first, second, width, lane), across in zip(pairs, (False, True), strict=True)
     ]
     return Gaps(
         high=np.concatenate([part.high for part in parts]),
@@ -127,25 +139,25 @@ def find_gaps(
         across=np.concatenate([part.across for part in parts]),
         width_mm=np.concatenate([part.width_mm for part in parts]),
         kind=np.concatenate([part.kind for part in parts]),
+        lane=np.concatenate([part.lane for part in parts]),
     )
 
 
-def _pairs_along(snapshot: MapSnapshot, stations: Stations, strips: Strips) -> tuple[IntArray, IntArray, Float64Array]:
+def _pairs_along(snapshot: MapSnapshot, stations: Stations, strips: Strips) -> Pairs:
     """Consecutive returns of each scanline."""
     order = strips.order[snapshot.neighbours[strips.order] > 0]
     first, second = order[:-1], order[1:]
     same = snapshot.line[first] == snapshot.line[second]
     first, second = first[same], second[same]
-    return first, second, np.nanmin(stations.stride_mm[snapshot.line[first]], axis=1, initial=np.inf)
+    line = snapshot.line[first]
+    return first, second, np.nanmin(stations.stride_mm[line], axis=1, initial=np.inf), stations.rank[line]
 
 
-def _pairs_across(
-    snapshot: MapSnapshot, stations: Stations, strips: Strips, fan: Fan
-) -> tuple[IntArray, IntArray, Float64Array]:
+def _pairs_across(snapshot: MapSnapshot, stations: Stations, strips: Strips, fan: Fan) -> Pairs:
     """Consecutive returns under the same ray, along the travel of each pass."""
     order = strips.order[snapshot.neighbours[strips.order] > 0]
     if len(order) < 2:
-        return order[:0], order[:0], np.zeros(0)
+        return order[:0], order[:0], np.zeros(0), order[:0]
     line = snapshot.line[order]
     group = stations.group[line]
     step = np.abs(np.diff(fan.angle_rad[order]))
@@ -168,7 +180,7 @@ def _pairs_across(
     same = (np.diff(column) == 0) & (np.diff(group) == 0)
     first, second = order[:-1][same], order[1:][same]
     distance = np.linalg.norm(snapshot.points_mm - snapshot.lines.laser_mm[snapshot.line], axis=1)
-    return first, second, 2.0 * pitch[group[:-1][same]] * distance[first]
+    return first, second, 2.0 * pitch[group[:-1][same]] * distance[first], column[:-1][same]
 
 
 def _classified(
@@ -180,6 +192,7 @@ def _classified(
     first: IntArray,
     second: IntArray,
     width: Float64Array,
+    lane: IntArray,
     across: bool,
 ) -> Gaps:
     """The pairs that are gaps; `first` and `second` follow each other, so a jump that goes on can be told."""
@@ -194,9 +207,19 @@ def _classified(
         np.abs(np.einsum("ij,ij->i", vector, snapshot.normals[first])),
         np.abs(np.einsum("ij,ij->i", vector, snapshot.normals[second])),
     )
-    leaves_surface = ~(off_tangent <= np.maximum(0.5 * reach, 0.2 * length))
+    place = stations.rank[line] if across else snapshot.index
+    lost = np.abs(place[second] - place[first]).astype(np.int64) - 1
+    # the sight that grazes a silhouette lies in its tangent plane, but what it hides is lost
+    leaves_surface = ~(off_tangent <= np.maximum(0.5 * reach, 0.2 * length)) | (lost > _LOST)
     sideways = np.sqrt(np.maximum(length**2 - drop**2, 0.0))
-    jump = (np.abs(drop) > reach) & (np.abs(drop) > sideways) & leaves_surface
+    steep = (np.abs(drop) > reach) & (np.abs(drop) > sideways)
+    jump = steep & leaves_surface
+    lower = np.where(drop >= 0, second, first)
+    if geometry is None:  # no camera may have been hidden: over lost places only a surface that goes on is a foot
+        facing = np.abs(np.einsum("ij,ij->i", snapshot.normals[lower], ray)) >= _FACING
+        jump &= (lost <= _LOST) | (facing & (snapshot.radius_rule[lower] != RadiusRule.GROWN))
+    lone = ~in_a_row(snapshot, strips, lower, np.full(len(lower), across))
+    jump &= ~(_far_walls(first, second, steep, drop, lost) & lone)
     usual = strips.nominal_point_spacing_mm[first]
     if across:
         usual = stations.stride_mm[line[first]].max(
@@ -204,7 +227,7 @@ def _classified(
         )
     apart = length > np.fmax(_LEAST_SPACINGS * usual, reach)
     goes_on = np.zeros(len(first), dtype=bool)
-    follows = (first[1:] == second[:-1]) & jump[1:] & jump[:-1] & (np.sign(drop[1:]) == np.sign(drop[:-1]))
+    follows = (first[1:] == second[:-1]) & steep[1:] & steep[:-1] & (np.sign(drop[1:]) == np.sign(drop[:-1]))
     thrice = follows[1:] & follows[:-1]  # two jumps in a row may be a wall with one return on it
     for shift in range(3):
         goes_on[shift : len(goes_on) - 2 + shift] |= thrice
@@ -213,9 +236,9 @@ def _classified(
     near = near_range_end(snapshot, stations, strips, fan, geometry)
     kind[near[first] & near[second]] = GapKind.OUT_OF_RANGE
     kind[jump] = GapKind.SHADOW
-    kind[jump & goes_on] = GapKind.FLANK
+    kind[(jump & goes_on) | (steep & ~leaves_surface)] = GapKind.FLANK
     settled = snapshot.settled[first] & snapshot.settled[second]
-    rows = np.flatnonzero((jump | apart) & settled)
+    rows = np.flatnonzero((steep | apart) & settled)
     kind[rows] = np.where(
         _seen_by_others(snapshot, stations, first[rows], second[rows], kind[rows]), GapKind.FILLED, kind[rows]
     )
@@ -226,7 +249,17 @@ def _classified(
         across=np.full(len(rows), across),
         width_mm=width[rows],
         kind=kind[rows],
+        lane=lane[rows],
     )
+
+
+def _far_walls(first: IntArray, second: IntArray, steep: BoolArray, drop: Float64Array, lost: IntArray) -> BoolArray:
+    """Jumps over lost places to a return from which the next pair jumps back up: nothing hangs between the two ends."""
+    far = np.zeros(len(first), dtype=bool)
+    back = (first[1:] == second[:-1]) & steep[1:] & steep[:-1] & (drop[:-1] > 0) & (drop[1:] < 0)
+    far[:-1] |= back & (lost[:-1] > _LOST) & (lost[1:] < lost[:-1])
+    far[1:] |= back & (lost[1:] > _LOST) & (lost[:-1] < lost[1:])
+    return far
 
 
 def _seen_by_others(

@@ -65,7 +65,8 @@ class Judgement:
     `required_per_mm2` and `judged_per_mm2` are the two sides of the comparison of counts, `spacing_per_mm2` the
     density that the spacing on the surface gives, 1 / (Δs'·δp) with the widest strip (NaN: unknown). `width_mm` (n, 2)
     are the strips' widths on the point's own surface (NaN: the surface ends or is unknown there), `failing_strip`
-    (n, 2) the strips that fail. `noise_mm` is the noise along the line (NaN: unknown or not asked for).
+    (n, 2) the strips that fail. `grazing` is True where the ray is known to graze the surface. `noise_mm` is the noise
+    along the line (NaN: unknown or not asked for).
     """
 
     judged: BoolArray
@@ -75,6 +76,7 @@ class Judgement:
     spacing_per_mm2: Float64Array
     width_mm: Float64Array
     failing_strip: BoolArray
+    grazing: BoolArray
     noise_mm: Float64Array
 
     def __post_init__(self) -> None:
@@ -146,7 +148,8 @@ def judge(
     reason = np.zeros(n, dtype=np.uint8)
     reason[too_few] = Reason.SPARSE
     reason[too_few & snapshot.isolated] = Reason.ISOLATED
-    reason[too_few & (flank | (incidence < _STEEP_RAY))] = Reason.STEEP
+    grazing = incidence < _STEEP_RAY
+    reason[too_few & (flank | grazing)] = Reason.STEEP
     coarse = delta > _SLACK * allowed[:, None]
     for mask, why in ((~coarse, Reason.STEEP), (coarse, Reason.SPARSE), (beyond, Reason.STEEP)):
         reason[(failing & mask).any(axis=1)] = why
@@ -172,7 +175,7 @@ def judge(
     below = gaps.low[rows]
     reason[below[(reason[below] == Reason.SPARSE) & ~failing[below].any(axis=1)]] = Reason.SHADOW
     reason[~judged] = Reason.NONE
-    return Judgement(judged, reason, required, counted_density, worst, width, failing, noise)
+    return Judgement(judged, reason, required, counted_density, worst, width, failing, grazing, noise)
 
 
 def _width_on_surface(snapshot: MapSnapshot, stations: Stations, strips: Strips, wall: BoolArray) -> Float64Array:

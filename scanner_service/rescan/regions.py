@@ -1,73 +1,34 @@
 """Rescan regions: connected patches of surface worth another pass, each with its reason; knows no poses."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
 from scanner_service.analysis.snapshot import MapSnapshot, UInt8Array
-from scanner_service.rescan.gaps import Gaps, fan_of, find_gaps
+from scanner_service.rescan.gaps import GapKind, Gaps, fan_of, find_gaps, gap_lengths_mm
 from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason, judge
-from scanner_service.rescan.outline import patch_of
+from scanner_service.rescan.patches import UPRIGHT, as_scanned, patches
+from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of
 from scanner_service.rescan.requirement import Requirement
-from scanner_service.rescan.shadows import shadow_groups
+from scanner_service.rescan.ribbons import Ribbon, shadow_ribbons
+from scanner_service.rescan.rungs import settled_kinds
 from scanner_service.rescan.stations import IntArray, stations_of
 from scanner_service.rescan.strips import Strips, strips_of
 
-_NEIGHBOURS = 6
-_HALF_PRIORITY_MM2 = 25.0
+_SHARED = 1.0 / 3.0  # share of a ribbon's upper or lower ends that makes it part of a flank
+_FOOT = 4.0  # radii: how long the foot of a flank may be that has no gaps of its own
+
+__all__ = ["RegionReport", "RescanRegion", "SmallPatches", "find_regions"]
 
 
 @dataclass(frozen=True, slots=True)
-class RescanRegion:
-    """A patch of surface worth another pass; part frame, millimetres.
+class SmallPatches:
+    """Patches of one reason too small to be listed: how many, their points, their area."""
 
-    `outline_mm` are closed loops of (k, 3) points on the surface, the longest first. `normal` (3,) is the mean unit
-    normal towards the laser, NaN if unknown; a wall's points to its open side. `measured_per_mm2` is the median density
-    that the spacing on the surface gives (0 in a shadow), `counting_error_per_mm2` the robust spread of the points
-    around it (1.4826 times the median absolute deviation). `priority` = deficit · area / (area + 25 mm²), where deficit
-    is 1 - measured / required, or 1 - limit / noise for noise, at least 1 - r / Δs' for steep surface, 1 out of range
-    and 0 for isolated points. 0 is not worth a pass, near 1 is large and empty.
-    `point_rows` (point_count,) are rows of the snapshot: the failing points, or a gap's ends.
-    """
-
-    number: int
-    reason: Reason
-    outline_mm: tuple[Float64Array, ...]
-    area_mm2: float
-    centroid_mm: Float64Array
-    normal: Float64Array
-    measured_per_mm2: float
-    required_per_mm2: float
-    counting_error_per_mm2: float
-    priority: float
+    count: int
     point_count: int
-    remedy: str
-    point_rows: IntArray
-
-    def __post_init__(self) -> None:
-        for array in (*self.outline_mm, self.centroid_mm, self.normal, self.point_rows):
-            read_only(array)
-
-    def to_dict(self) -> dict[str, object]:
-        """For JSON: plain numbers and lists, None where a value is unknown, without the point rows."""
-        return {
-            "number": self.number,
-            "reason": self.reason.label,
-            "remedy": self.remedy,
-            "area_mm2": self.area_mm2,
-            "centroid_mm": self.centroid_mm.tolist(),
-            "normal": None if np.isnan(self.normal).any() else self.normal.tolist(),
-            "measured_per_mm2": _known(self.measured_per_mm2),
-            "required_per_mm2": _known(self.required_per_mm2),
-            "counting_error_per_mm2": _known(self.counting_error_per_mm2),
-            "priority": self.priority,
-            "point_count": self.point_count,
-            "outline_mm": [loop.tolist() for loop in self.outline_mm],
-        }
+    area_mm2: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +36,10 @@ class RegionReport:
     """The regions of a map, by falling priority, and the verdict on every point (arrays of n rows).
 
     `rescan` marks the points of regions; `reason` is the point's own verdict, which may be other than NONE outside of
-    any region (a patch of fewer points than the requirement asks). `counts` are points by verdict: `ok`, each reason,
-    `unsettled`, `not_counted`, `requirement_unknown`; they add up to n. `judgement`, `strips` and `gaps` are what the
-    report was made from.
+    any region (a patch smaller than the requirement asks). `counts` are points by verdict: `ok`, each reason,
+    `unsettled`, `not_counted`, `requirement_unknown`; they add up to n. `small_patches` are, by reason, the patches
+    that are too small to be regions; the area of those with fewer points than a region is taken from the nominal
+    spacings. `judgement`, `strips` and `gaps` are what the report was made from.
     """
 
     version: int
@@ -85,15 +47,27 @@ class RegionReport:
     rescan: BoolArray
     reason: UInt8Array
     counts: dict[str, int]
+    small_patches: dict[str, SmallPatches]
     judgement: Judgement
     strips: Strips
     gaps: Gaps
 
+    @property
+    def gap_mm2(self) -> float:
+        """Area of all shadows, those of the small patches included."""
+        small = self.small_patches.get(Reason.SHADOW.label)
+        listed = sum(region.area_mm2 for region in self.regions if region.reason is Reason.SHADOW)
+        return listed + (small.area_mm2 if small else 0.0)
+
     def to_dict(self) -> dict[str, object]:
-        """For JSON: the regions and the counts."""
+        """For JSON: the regions, the counts and what was too small to be a region."""
         return {
             "version": self.version,
             "counts": dict(self.counts),
+            "small_patches": {
+                reason: {"count": small.count, "point_count": small.point_count, "area_mm2": small.area_mm2}
+                for reason, small in self.small_patches.items()
+            },
             "regions": [region.to_dict() for region in self.regions],
         }
 
@@ -122,20 +96,42 @@ def find_regions(
     stations = stations_of(snapshot.lines)
     strips = strips_of(snapshot, stations, requirement)
     fan = fan_of(snapshot, stations, strips, towards_sensor)
-    gaps = find_gaps(snapshot, stations, strips, fan, geometry)
+    gaps = settled_kinds(snapshot, strips, find_gaps(snapshot, stations, strips, fan, geometry))
     judgement = judge(snapshot, requirement, stations, strips, fan, gaps, geometry, noise_mm)
-    drafts = _shadow_regions(snapshot, requirement, strips, gaps, judgement)
+    ribbons = shadow_ribbons(snapshot, requirement, strips, gaps)
+    ribbons, gaps, judgement = _flanks_completed(snapshot, ribbons, strips, gaps, judgement)
+    drafts = _shadow_regions(ribbons, gaps, judgement)
+    small: list[tuple[Reason, int, float]] = []
+    unfolded = as_scanned(snapshot, stations, strips, fan)
     for reason in Reason:
         if reason not in (Reason.NONE, Reason.SHADOW):
-            drafts += _patches(snapshot, requirement, strips, gaps, judgement, reason, noise_mm)
-    drafts.sort(key=lambda draft: (-draft.priority, *draft.centroid_mm.tolist()))
-    regions = tuple(_numbered(draft, number) for number, draft in enumerate(drafts, start=1))
+            large, few = patches(snapshot, requirement, strips, gaps, judgement, unfolded, reason, noise_mm)
+            drafts += large
+            small += [(reason, len(rows), _nominal_area(strips, rows)) for rows in few]
+    listed = []
+    least = requirement.least_area_mm2(float(np.median(strips.reach_mm)) if len(snapshot) else 0.0)
+    for draft in drafts:
+        if draft.point_count >= requirement.region_points and draft.area_mm2 >= least:
+            listed.append(draft)
+        else:
+            small.append((draft.reason, draft.point_count, draft.area_mm2))
+    listed.sort(key=lambda draft: (-draft.priority, *draft.centroid_mm.tolist()))
+    regions = tuple(replace(draft, number=number) for number, draft in enumerate(listed, start=1))
     rescan = np.zeros(len(snapshot), dtype=bool)
     for region in regions:
         rescan[region.point_rows] = True
     read_only(rescan)
-    counts = _counts(snapshot, judgement)
-    return RegionReport(snapshot.version, regions, rescan, judgement.reason, counts, judgement, strips, gaps)
+    return RegionReport(
+        version=snapshot.version,
+        regions=regions,
+        rescan=rescan,
+        reason=judgement.reason,
+        counts=_counts(snapshot, judgement),
+        small_patches=_by_reason(small),
+        judgement=judgement,
+        strips=strips,
+        gaps=gaps,
+    )
 
 
 def _counts(snapshot: MapSnapshot, judgement: Judgement) -> dict[str, int]:
@@ -151,167 +147,84 @@ def _counts(snapshot: MapSnapshot, judgement: Judgement) -> dict[str, int]:
     return counts
 
 
-def _patches(
-    snapshot: MapSnapshot,
-    requirement: Requirement,
-    strips: Strips,
-    gaps: Gaps,
-    judgement: Judgement,
-    reason: Reason,
-    noise_mm: float | None,
-) -> list[RescanRegion]:
-    """Connected patches of the points that fail for one reason."""
-    rows = np.flatnonzero(judgement.reason == reason).astype(np.int64)
-    if len(rows) < requirement.region_points:
-        return []
-    connection = strips.reach_mm.copy()
-    wide = np.where(judgement.failing_strip & np.isfinite(strips.width_mm), strips.width_mm, 0.0).max(axis=1)
-    connection = np.maximum(connection, wide)
-    edges = [_near_edges(snapshot.points_mm[rows], connection[rows])]
-    place = np.full(len(snapshot), -1, dtype=np.int64)
-    place[rows] = np.arange(len(rows))
-    for side in (0, 1):
-        link = strips.link[rows, side]
-        close = (link >= 0) & (strips.width_mm[rows, side] <= connection[rows])
-        edges.append(np.column_stack([np.flatnonzero(close), place[link[close]]]))
-    if reason is Reason.OUT_OF_RANGE:
-        edges.append(np.column_stack([place[gaps.high], place[gaps.low]]))
-        span = np.linalg.norm(snapshot.points_mm[gaps.high] - snapshot.points_mm[gaps.low], axis=1)
-        np.maximum.at(connection, gaps.high, span)
-    edge = np.concatenate(edges)
-    edge = edge[(edge >= 0).all(axis=1)]
-    cosine = np.einsum("ij,ij->i", snapshot.normals[rows[edge[:, 0]]], snapshot.normals[rows[edge[:, 1]]])
-    edge = edge[~(cosine < np.cos(np.radians(requirement.region_angle_deg)))]
-    graph = coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), shape=(len(rows), len(rows)))
-    label = connected_components(graph, directed=False)[1]
-    by_label = np.argsort(label, kind="stable")
-    groups = np.split(rows[by_label], np.flatnonzero(np.diff(label[by_label])) + 1)
-    return [
-        _region(snapshot, requirement, strips, judgement, reason, group, connection[group], noise_mm)
-        for group in groups
-        if len(group) >= requirement.region_points
-    ]
+def _by_reason(small: list[tuple[Reason, int, float]]) -> dict[str, SmallPatches]:
+    """Small patches (reason, points, area) added up by reason, in the order of the reasons."""
+    found: dict[str, SmallPatches] = {}
+    for reason in Reason:
+        mine = [(points, area_mm2) for why, points, area_mm2 in small if why is reason]
+        if mine:
+            found[reason.label] = SmallPatches(len(mine), sum(m[0] for m in mine), float(sum(m[1] for m in mine)))
+    return found
 
 
-def _near_edges(points_mm: Float64Array, connection_mm: Float64Array) -> IntArray:
-    """(e, 2) pairs of nearest neighbours within the larger of the two connection lengths."""
-    k = min(_NEIGHBOURS + 1, len(points_mm))
-    if k < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    found = cKDTree(points_mm).query(points_mm, k=k)
-    distance, other = np.asarray(found[0]), np.asarray(found[1], dtype=np.int64)
-    first = np.repeat(np.arange(len(points_mm)), k - 1)
-    second = other[:, 1:].reshape(-1)
-    near = distance[:, 1:].reshape(-1) <= np.maximum(connection_mm[first], connection_mm[second])
-    return np.column_stack([first[near], second[near]]).astype(np.int64)
+def _nominal_area(strips: Strips, rows: IntArray) -> float:
+    """Area that points stand for by the spacings of their scanlines."""
+    return float((strips.line_spacing_mm[rows] * strips.nominal_point_spacing_mm[rows]).sum())
 
 
-def _region(
-    snapshot: MapSnapshot,
-    requirement: Requirement,
-    strips: Strips,
-    judgement: Judgement,
-    reason: Reason,
-    rows: IntArray,
-    connection_mm: Float64Array,
-    noise_mm: float | None,
-) -> RescanRegion:
-    """One patch of failing points."""
-    spacing = np.fmin(strips.nominal_point_spacing_mm[rows], connection_mm)
-    patch = patch_of(snapshot.points_mm[rows], connection_mm, spacing)
-    normal = _mean_normal(snapshot.normals[rows])
-    if np.isnan(normal).any():
-        towards = snapshot.lines.laser_mm[snapshot.line[rows]].mean(axis=0) - patch.centroid_mm
-        normal = np.where(patch.normal @ towards < 0, -patch.normal, patch.normal)
-    measured = judgement.spacing_per_mm2[rows]
-    by_count = judgement.judged_per_mm2[rows]
-    values = by_count if reason is Reason.NOISY else np.where(np.isfinite(measured), measured, by_count)
-    required = float(np.median(judgement.required_per_mm2[rows]))
-    middle = float(np.median(values))
-    deficit = 1.0 - middle / required
-    if reason is Reason.NOISY and noise_mm is not None:
-        deficit = 1.0 - requirement.noise_factor * noise_mm / float(np.median(judgement.noise_mm[rows]))
-    elif reason is Reason.STEEP:
-        deficit = max(deficit, 1.0 - float(np.median(strips.reach_mm[rows] / connection_mm)))
-    elif reason is Reason.OUT_OF_RANGE:
-        deficit = 1.0
-    elif reason is Reason.ISOLATED:
-        deficit = 0.0
-    return RescanRegion(
-        number=0,
-        reason=reason,
-        outline_mm=patch.loops,
-        area_mm2=patch.area_mm2,
-        centroid_mm=patch.centroid_mm,
-        normal=normal,
-        measured_per_mm2=middle,
-        required_per_mm2=required,
-        counting_error_per_mm2=1.4826 * float(np.median(np.abs(values - middle))),
-        priority=_priority(deficit, patch.area_mm2),
-        point_count=len(rows),
-        remedy=REMEDIES[reason],
-        point_rows=rows,
-    )
+def _flanks_completed(
+    snapshot: MapSnapshot, ribbons: list[Ribbon], strips: Strips, gaps: Gaps, judgement: Judgement
+) -> tuple[list[Ribbon], Gaps, Judgement]:
+    """The ribbons that are shadows in their own right, gaps and verdicts with the others given to the flanks beside.
+
+    The foot of a flank is often too upright for returns. A ribbon straight below or above the points of a flank, a
+    third of whose upper or lower ends are such points, and not much longer than the flank's own gaps, is a part of that
+    flank. Its other ends, where they have a plane of their own, are sound.
+    """
+    steep = judgement.reason == Reason.STEEP
+    flank = gaps.of_kind(GapKind.FLANK)
+    steep[gaps.high[flank]] = steep[gaps.low[flank]] = True
+    steep &= judgement.judged
+    span = np.zeros(len(snapshot))
+    for end in (gaps.high, gaps.low):
+        np.maximum.at(span, end[flank], gap_lengths_mm(snapshot, gaps, flank))
+    kind, reason = gaps.kind.copy(), judgement.reason.copy()
+    of_flank = np.where(judgement.grazing | ~snapshot.reliable, Reason.STEEP, Reason.NONE)
+    shadows = []
+    for ribbon in ribbons:
+        high, low = gaps.high[ribbon.gaps], gaps.low[ribbon.gaps]
+        reach = float(np.median(strips.reach_mm[high]))
+        beside = span[np.concatenate([high, low])]
+        longest = max(2.0 * float(np.median(beside[beside > 0])) if (beside > 0).any() else 0.0, _FOOT * reach)
+        upright = ribbon.overhang_mm <= UPRIGHT * reach
+        upright &= float(np.median(gap_lengths_mm(snapshot, gaps, ribbon.gaps))) <= longest
+        if upright and max(float(steep[high].mean()), float(steep[low].mean())) > _SHARED:
+            kind[ribbon.gaps] = GapKind.FLANK
+            ends = np.concatenate([high, low])
+            ends = ends[reason[ends] == Reason.SHADOW]
+            reason[ends] = of_flank[ends]
+        else:
+            shadows.append(ribbon)
+    for ribbon in shadows:  # ends that a shadow shares with a flank
+        ends = np.concatenate([gaps.high[ribbon.gaps], gaps.low[ribbon.gaps]])
+        ends = ends[judgement.reason[ends] == Reason.SHADOW]
+        reason[ends] = Reason.SHADOW
+    return shadows, replace(gaps, kind=kind), replace(judgement, reason=reason)
 
 
-def _shadow_regions(
-    snapshot: MapSnapshot, requirement: Requirement, strips: Strips, gaps: Gaps, judgement: Judgement
-) -> list[RescanRegion]:
-    """Regions of surface that no ray reached, from the gaps around them."""
+def _shadow_regions(ribbons: list[Ribbon], gaps: Gaps, judgement: Judgement) -> list[RescanRegion]:
+    """Surface that no ray reached, as regions without a number, however small."""
     regions = []
-    for group in shadow_groups(snapshot, requirement, strips, gaps):
-        rows = np.unique(np.concatenate([gaps.high[group.gaps], gaps.low[group.gaps]])).astype(np.int64)
+    for ribbon in ribbons:
+        rows = np.unique(np.concatenate([gaps.high[ribbon.gaps], gaps.low[ribbon.gaps]])).astype(np.int64)
         rows = rows[judgement.judged[rows]]
-        if len(rows) < requirement.region_points:
+        if not len(rows):
             continue
-        span = np.zeros(len(snapshot))
-        length = np.linalg.norm(
-            snapshot.points_mm[gaps.high[group.gaps]] - snapshot.points_mm[gaps.low[group.gaps]], axis=1
-        )
-        np.maximum.at(span, gaps.high[group.gaps], length)
-        np.maximum.at(span, gaps.low[group.gaps], length)
-        patch = patch_of(
-            snapshot.points_mm[rows], strips.reach_mm[rows] + span[rows], strips.nominal_point_spacing_mm[rows]
-        )
         regions.append(
             RescanRegion(
                 number=0,
                 reason=Reason.SHADOW,
-                outline_mm=patch.loops,
-                area_mm2=group.area_mm2,
-                centroid_mm=patch.centroid_mm,
-                normal=_mean_normal(group.normals),
+                outline_mm=ribbon.loops,
+                area_mm2=ribbon.area_mm2,
+                centroid_mm=ribbon.centroid_mm,
+                normal=mean_normal(ribbon.normals),
                 measured_per_mm2=0.0,
                 required_per_mm2=float(np.median(judgement.required_per_mm2[rows])),
                 counting_error_per_mm2=0.0,
-                priority=_priority(1.0, group.area_mm2),
+                priority=priority_of(1.0, ribbon.area_mm2),
                 point_count=len(rows),
                 remedy=REMEDIES[Reason.SHADOW],
                 point_rows=rows,
             )
         )
     return regions
-
-
-def _mean_normal(normals: Float64Array) -> Float64Array:
-    """Unit mean of the known normals; NaN where none is known or they point everywhere."""
-    known = normals[np.isfinite(normals).all(axis=1)]
-    total = known.sum(axis=0)
-    length = float(np.linalg.norm(total))
-    if not len(known) or length < 0.5 * len(known):
-        return np.full(3, np.nan)
-    return np.asarray(total / length, dtype=np.float64)
-
-
-def _priority(deficit: float, area_mm2: float) -> float:
-    """Share of the requirement that is missing, times how large the area is beside 25 mm²."""
-    return max(0.0, min(1.0, deficit)) * area_mm2 / (area_mm2 + _HALF_PRIORITY_MM2)
-
-
-def _numbered(draft: RescanRegion, number: int) -> RescanRegion:
-    values = {name: getattr(draft, name) for name in RescanRegion.__slots__}
-    return RescanRegion(**{**values, "number": number})
-
-
-def _known(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from drivers.scanline import Float64Array, read_only
+from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.stations import IntArray, Stations
@@ -85,6 +85,18 @@ def strips_of(snapshot: MapSnapshot, stations: Stations, requirement: Requiremen
         along=along,
         order=order,
     )
+
+
+def in_a_row(snapshot: MapSnapshot, strips: Strips, rows: IntArray, across: BoolArray) -> BoolArray:
+    """Whether points have a near neighbour on both sides: along their line where `across`, in the lines beside else."""
+    order = strips.order
+    step = np.linalg.norm(np.diff(snapshot.points_mm[order], axis=0), axis=1)
+    near: BoolArray = np.logical_and(np.diff(snapshot.line[order]) == 0, step <= strips.reach_mm[order[1:]])
+    along = np.zeros(len(snapshot), dtype=bool)
+    along[order[1:-1]] = near[1:] & near[:-1]
+    over_lines = np.all(strips.width_mm <= strips.reach_mm[:, None], axis=1)
+    row: BoolArray = np.where(across, along[rows], over_lines[rows])
+    return row
 
 
 def _point_spacing_of_lines(snapshot: MapSnapshot, stations: Stations) -> Float64Array:

@@ -22,7 +22,7 @@ from matplotlib.patheffects import withStroke
 from drivers.scanline import Float64Array
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.storage.exports.density_raster import DensityRaster, View, judged, rasterise, view_along
-from scanner_service.storage.exports.label_places import label_places
+from scanner_service.storage.exports.label_places import label_places, pointed_at
 
 Colours = Literal["viridis", "blue-red"]
 
@@ -201,14 +201,12 @@ def _outlines(axes: Axes, regions: Sequence[OutlinedRegion], view: View) -> dict
 def _labels(axes: Axes, regions: Sequence[OutlinedRegion], view: View) -> None:
     """Number the first regions beside their longest outline, with a line to it."""
     named = [(region.number, loops[0]) for region in regions if (loops := _loops(region))][:_LABELS]
-    boxes = []
-    for _, loop in named:
-        flat = np.stack([loop @ view.right, loop @ view.up], axis=1)
-        boxes.append((flat.min(axis=0), flat.max(axis=0)))
+    flat = [np.stack([loop @ view.right, loop @ view.up], axis=1) for _, loop in named]
+    boxes = [(loop.min(axis=0), loop.max(axis=0)) for loop in flat]
     span = axes.get_xlim()[1] - axes.get_xlim()[0]
     tall = axes.get_ylim()[1] - axes.get_ylim()[0]
     size = max(span, tall) * (0.030 if len(named) <= 20 else 0.024)
-    middles = [(float(low[0] + high[0]) / 2, float(low[1] + high[1]) / 2) for low, high in boxes]
+    middles = [pointed_at(loop) for loop in flat]
     halves = [(float(high[0] - low[0]) / 2, float(high[1] - low[1]) / 2) for low, high in boxes]
     places = label_places(middles, halves, (size, 0.8 * size))
     for (number, _), place, middle in zip(named, places, middles, strict=True):

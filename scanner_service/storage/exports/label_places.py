@@ -10,6 +10,21 @@ _DIRECTIONS = np.radians([90, 45, 135, 0, 180, -45, -135, -90])
 _RINGS = 7
 
 
+def pointed_at(loop: Float64Array) -> tuple[float, float]:
+    """Where a label's line should end: in the middle of a closed loop (k, 2), or at its nearest vertex.
+
+    The middle is that of the box around the loop; the vertex is taken where the middle lies outside (even-odd rule).
+    """
+    middle = 0.5 * (loop.min(axis=0) + loop.max(axis=0))
+    start, end = loop - middle, np.roll(loop, -1, axis=0) - middle
+    crosses = (start[:, 1] > 0) != (end[:, 1] > 0)
+    rise = np.where(crosses, end[:, 1] - start[:, 1], 1.0)
+    right = start[:, 0] - start[:, 1] * (end[:, 0] - start[:, 0]) / rise > 0
+    if int((crosses & right).sum()) % 2 == 0:
+        middle = loop[np.argmin((start**2).sum(axis=1))]
+    return float(middle[0]), float(middle[1])
+
+
 def label_places(
     anchors: Sequence[tuple[float, float]], half_sizes: Sequence[tuple[float, float]], label: tuple[float, float]
 ) -> list[Float64Array]:

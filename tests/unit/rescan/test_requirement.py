@@ -17,6 +17,15 @@ def test_a_stated_density_is_required_everywhere() -> None:
 
 
 @pytest.mark.parametrize(
+    ("stated", "radius_mm", "least"), [(None, 0.2, 1.0), (None, 1.0, np.pi), (0.3, 1.0, 0.3), (0.0, 1.0, 0.0)]
+)
+def test_the_least_area_is_the_one_stated_or_one_square_millimetre_or_the_disc_of_a_neighbourhood(
+    stated: float | None, radius_mm: float, least: float
+) -> None:
+    assert Requirement(region_area_mm2=stated).least_area_mm2(radius_mm) == pytest.approx(least)
+
+
+@pytest.mark.parametrize(
     ("field", "value"),
     [
         ("density_per_mm2", 0.0),
@@ -28,6 +37,8 @@ def test_a_stated_density_is_required_everywhere() -> None:
         ("radius_constant_mm", 0.0),
         ("noise_factor", 0.5),
         ("region_points", 0),
+        ("region_area_mm2", -0.1),
+        ("region_area_mm2", float("nan")),
         ("region_angle_deg", 0.0),
         ("search_mm", -2.0),
     ],

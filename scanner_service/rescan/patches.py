@@ -1,0 +1,173 @@
+"""Connected patches of points that fail for one reason, each as a region; knows verdicts, takes none."""
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from drivers.scanline import Float64Array
+from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.rescan.gaps import Fan, GapKind, Gaps
+from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason
+from scanner_service.rescan.outline import patch_of
+from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of
+from scanner_service.rescan.requirement import Requirement
+from scanner_service.rescan.stations import IntArray, Stations
+from scanner_service.rescan.strips import Strips
+
+_NEIGHBOURS = 6
+_BRIDGE = 2.0  # steep patches this many radii apart are one: single returns break them up
+UPRIGHT = 2.0  # the ends of a flank's gap lie within this many radii of one ray
+_LONGEST = 6.0  # radii that an outline reaches at most to join the two ends of a gap
+_GAP_SHARE = 0.75  # a triangle with a gap for a side has about this circumradius in gap lengths
+
+
+def patches(
+    snapshot: MapSnapshot,
+    requirement: Requirement,
+    strips: Strips,
+    gaps: Gaps,
+    judgement: Judgement,
+    unfolded_mm: Float64Array,
+    reason: Reason,
+    noise_mm: float | None,
+) -> tuple[list[RescanRegion], list[IntArray]]:
+    """The patches of one reason as regions without a number, and the rows of those too few for a region.
+
+    `unfolded_mm` (n, 2) are ray and line of every point, as `as_scanned` has them.
+    """
+    rows = np.flatnonzero(judgement.reason == reason).astype(np.int64)
+    if not len(rows):
+        return [], []
+    wide = np.where(judgement.failing_strip & np.isfinite(strips.width_mm), strips.width_mm, 0.0).max(axis=1)
+    steep = reason is Reason.STEEP
+    near = _BRIDGE * strips.reach_mm if steep else np.maximum(strips.reach_mm, wide)
+    connection = np.maximum(near, wide)
+    links, span = _links(snapshot, strips, gaps, reason, rows)
+    place = np.full(len(snapshot), -1, dtype=np.int64)
+    place[rows] = np.arange(len(rows))
+    edges = [_near_edges(snapshot.points_mm[rows], near[rows]), place[links]]
+    for side in (0, 1):
+        link = strips.link[rows, side]
+        close = (link >= 0) & (strips.width_mm[rows, side] <= connection[rows])
+        if steep:
+            close[close] = overhang_mm(snapshot, rows[close], link[close]) <= UPRIGHT * strips.reach_mm[rows[close]]
+        edges.append(np.column_stack([np.flatnonzero(close), place[link[close]]]))
+    edge = np.concatenate(edges)
+    edge = edge[(edge >= 0).all(axis=1)]
+    cosine = np.einsum("ij,ij->i", snapshot.normals[rows[edge[:, 0]]], snapshot.normals[rows[edge[:, 1]]])
+    edge = edge[~(cosine < np.cos(np.radians(requirement.region_angle_deg)))]
+    graph = coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), shape=(len(rows), len(rows)))
+    label = connected_components(graph, directed=False)[1]
+    by_label = np.argsort(label, kind="stable")
+    groups = np.split(rows[by_label], np.flatnonzero(np.diff(label[by_label])) + 1)
+    np.maximum.at(connection, links[:, 0], span)
+    if steep:
+        np.maximum.at(connection, links[:, 1], span)
+    large = [
+        _region(snapshot, requirement, strips, judgement, unfolded_mm, reason, group, connection[group], noise_mm)
+        for group in groups
+        if len(group) >= requirement.region_points
+    ]
+    return large, [group for group in groups if len(group) < requirement.region_points]
+
+
+def as_scanned(snapshot: MapSnapshot, stations: Stations, strips: Strips, fan: Fan) -> Float64Array:
+    """(n, 2) every point by its ray and its scanline, each pass on its own scale: no surface folds there."""
+    distance = np.linalg.norm(snapshot.points_mm - snapshot.lines.laser_mm[snapshot.line], axis=1)
+    ray = fan.angle_rad * (float(np.median(distance)) if len(distance) else 0.0)
+    return np.column_stack([ray, stations.rank[snapshot.line] * strips.line_spacing_mm])
+
+
+def _links(
+    snapshot: MapSnapshot, strips: Strips, gaps: Gaps, reason: Reason, rows: IntArray
+) -> tuple[IntArray, Float64Array]:
+    """(e, 2) rows that are on one surface whatever lies between, and (e,) how far an outline reaches to join them.
+
+    The two ends of a gap in a flank are on the flank, those of a gap at the range's end on what is out of range.
+    """
+    kind = {Reason.OUT_OF_RANGE: GapKind.OUT_OF_RANGE, Reason.STEEP: GapKind.FLANK}.get(reason)
+    if kind is None:
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0)
+    own = np.zeros(len(snapshot), dtype=bool)
+    own[rows] = True
+    bridging = gaps.of_kind(kind)
+    bridging = bridging[own[gaps.high[bridging]] & own[gaps.low[bridging]]]
+    high, low = gaps.high[bridging], gaps.low[bridging]
+    share = 1.0 if reason is Reason.OUT_OF_RANGE else _GAP_SHARE
+    span = share * np.linalg.norm(snapshot.points_mm[high] - snapshot.points_mm[low], axis=1)
+    if reason is Reason.STEEP:  # what a ray meets far aside or far below is another surface
+        reach = strips.reach_mm[high]
+        own_surface = (overhang_mm(snapshot, high, low) <= UPRIGHT * reach) & (span <= _LONGEST * reach)
+        high, low, span = high[own_surface], low[own_surface], span[own_surface]
+    return np.column_stack([high, low]), span
+
+
+def overhang_mm(snapshot: MapSnapshot, first: IntArray, second: IntArray) -> Float64Array:
+    """(k,) how far points lie from the rays through others."""
+    ray = snapshot.points_mm[first] - snapshot.lines.laser_mm[snapshot.line[first]]
+    aside = np.cross(snapshot.points_mm[second] - snapshot.points_mm[first], ray)
+    return np.asarray(np.linalg.norm(aside, axis=1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12))
+
+
+def _near_edges(points_mm: Float64Array, connection_mm: Float64Array) -> IntArray:
+    """(e, 2) pairs of nearest neighbours within the larger of the two connection lengths."""
+    k = min(_NEIGHBOURS + 1, len(points_mm))
+    if k < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    found = cKDTree(points_mm).query(points_mm, k=k)
+    distance, other = np.asarray(found[0]), np.asarray(found[1], dtype=np.int64)
+    first = np.repeat(np.arange(len(points_mm)), k - 1)
+    second = other[:, 1:].reshape(-1)
+    near = distance[:, 1:].reshape(-1) <= np.maximum(connection_mm[first], connection_mm[second])
+    return np.column_stack([first[near], second[near]]).astype(np.int64)
+
+
+def _region(
+    snapshot: MapSnapshot,
+    requirement: Requirement,
+    strips: Strips,
+    judgement: Judgement,
+    unfolded_mm: Float64Array,
+    reason: Reason,
+    rows: IntArray,
+    connection_mm: Float64Array,
+    noise_mm: float | None,
+) -> RescanRegion:
+    """One patch of failing points."""
+    spacing = np.fmin(strips.nominal_point_spacing_mm[rows], connection_mm)
+    one_pass = bool((strips.group[rows] == strips.group[rows[0]]).all())
+    patch = patch_of(snapshot.points_mm[rows], connection_mm, spacing, unfolded_mm[rows] if one_pass else None)
+    normal = mean_normal(snapshot.normals[rows])
+    if np.isnan(normal).any():
+        towards = snapshot.lines.laser_mm[snapshot.line[rows]].mean(axis=0) - patch.centroid_mm
+        normal = np.where(patch.normal @ towards < 0, -patch.normal, patch.normal)
+    measured = judgement.spacing_per_mm2[rows]
+    by_count = judgement.judged_per_mm2[rows]
+    values = by_count if reason is Reason.NOISY else np.where(np.isfinite(measured), measured, by_count)
+    required = float(np.median(judgement.required_per_mm2[rows]))
+    middle = float(np.median(values))
+    deficit = 1.0 - middle / required
+    if reason is Reason.NOISY and noise_mm is not None:
+        deficit = 1.0 - requirement.noise_factor * noise_mm / float(np.median(judgement.noise_mm[rows]))
+    elif reason is Reason.STEEP:
+        deficit = max(deficit, 1.0 - float(np.median(strips.reach_mm[rows] / connection_mm)))
+    elif reason is Reason.OUT_OF_RANGE:
+        deficit = 1.0
+    elif reason is Reason.ISOLATED:
+        deficit = 0.0
+    return RescanRegion(
+        number=0,
+        reason=reason,
+        outline_mm=patch.loops,
+        area_mm2=patch.area_mm2,
+        centroid_mm=patch.centroid_mm,
+        normal=normal,
+        measured_per_mm2=middle,
+        required_per_mm2=required,
+        counting_error_per_mm2=1.4826 * float(np.median(np.abs(values - middle))),
+        priority=priority_of(deficit, patch.area_mm2),
+        point_count=len(rows),
+        remedy=REMEDIES[reason],
+        point_rows=rows,
+    )

@@ -1,0 +1,79 @@
+"""One rescan region as it is told: where, how large, why, and how urgent; finds none."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.scanline import Float64Array, read_only
+from scanner_service.rescan.judgement import Reason
+from scanner_service.rescan.stations import IntArray
+
+_HALF_PRIORITY_MM2 = 25.0
+
+
+@dataclass(frozen=True, slots=True)
+class RescanRegion:
+    """A patch of surface worth another pass; part frame, millimetres.
+
+    `outline_mm` are closed loops of (k, 3) points on the surface, the longest first. `normal` (3,) is the mean unit
+    normal towards the laser, NaN if unknown; a wall's points to its open side. `measured_per_mm2` is the median density
+    that the spacing on the surface gives (0 in a shadow), `counting_error_per_mm2` the robust spread of the points
+    around it (1.4826 times the median absolute deviation). `priority` = deficit · area / (area + 25 mm²), where deficit
+    is 1 - measured / required, or 1 - limit / noise for noise, at least 1 - r / Δs' for steep surface, 1 out of range
+    and 0 for isolated points. 0 is not worth a pass, near 1 is large and empty.
+    `point_rows` (point_count,) are rows of the snapshot: the failing points, or a gap's ends.
+    """
+
+    number: int
+    reason: Reason
+    outline_mm: tuple[Float64Array, ...]
+    area_mm2: float
+    centroid_mm: Float64Array
+    normal: Float64Array
+    measured_per_mm2: float
+    required_per_mm2: float
+    counting_error_per_mm2: float
+    priority: float
+    point_count: int
+    remedy: str
+    point_rows: IntArray
+
+    def __post_init__(self) -> None:
+        for array in (*self.outline_mm, self.centroid_mm, self.normal, self.point_rows):
+            read_only(array)
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON: plain numbers and lists, None where a value is unknown, without the point rows."""
+        return {
+            "number": self.number,
+            "reason": self.reason.label,
+            "remedy": self.remedy,
+            "area_mm2": self.area_mm2,
+            "centroid_mm": self.centroid_mm.tolist(),
+            "normal": None if np.isnan(self.normal).any() else self.normal.tolist(),
+            "measured_per_mm2": _known(self.measured_per_mm2),
+            "required_per_mm2": _known(self.required_per_mm2),
+            "counting_error_per_mm2": _known(self.counting_error_per_mm2),
+            "priority": self.priority,
+            "point_count": self.point_count,
+            "outline_mm": [loop.tolist() for loop in self.outline_mm],
+        }
+
+
+def mean_normal(normals: Float64Array) -> Float64Array:
+    """Unit mean of the known normals; NaN where none is known or they point everywhere."""
+    known = normals[np.isfinite(normals).all(axis=1)]
+    total = known.sum(axis=0)
+    length = float(np.linalg.norm(total))
+    if not len(known) or length < 0.5 * len(known):
+        return np.full(3, np.nan)
+    return np.asarray(total / length, dtype=np.float64)
+
+
+def priority_of(deficit: float, area_mm2: float) -> float:
+    """Share of the requirement that is missing, times how large the area is beside 25 mm²."""
+    return max(0.0, min(1.0, deficit)) * area_mm2 / (area_mm2 + _HALF_PRIORITY_MM2)
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
