@@ -153,6 +153,8 @@ class NativeHost:
             self._call_off(now_s)
             if self.plan is not None:
                 self.plan.resume = False
+        if on and not self._keeps_alive:
+            self._heard_s = now_s  # an idle device is asked for nothing: its silence counts from here
         self._laser_wanted = on
         return self._request(Laser(self._new_id(), on), now_s, then)
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.errors import MapFull
+from scanner_service.analysis.flexible import flexible_radii_mm
 from scanner_service.analysis.global_radius import GlobalRadius
 from scanner_service.analysis.grid import (
     SMALLEST_SIDE_Q,
@@ -26,16 +27,9 @@ from scanner_service.analysis.grid import (
     take_stale,
 )
 from scanner_service.analysis.intake import QUANTUM_MM, StoredLine
+from scanner_service.analysis.kernel_rules import Lines, Rules
 from scanner_service.analysis.line_columns import LineColumns
-from scanner_service.analysis.neighbourhood import (
-    Lines,
-    Rules,
-    drop_pass,
-    evaluate_cells,
-    flexible_radii_mm,
-    list_unsettled,
-    settle_listed,
-)
+from scanner_service.analysis.neighbourhood import evaluate_cells
 from scanner_service.analysis.passes import Pass, PassBook, PassKey
 from scanner_service.analysis.points import (
     GROWTH_REACH,
@@ -47,6 +41,7 @@ from scanner_service.analysis.points import (
     write_points,
 )
 from scanner_service.analysis.radius import RadiusSettings, line_radius, point_spacing_mm
+from scanner_service.analysis.settling import drop_pass, list_unsettled, settle_listed
 from scanner_service.analysis.snapshot import Int32Array, MapSnapshot, RadiusRule, Unreliable
 
 

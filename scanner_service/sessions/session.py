@@ -171,6 +171,8 @@ class LiveSession:
 
     def line(self, line: Scanline | StoredLine) -> None:
         """A scanline from the source; lines that come when the engine is gone are counted by it."""
+        if self._state == "paused":  # lines flow again, whatever was or was not said of the link
+            self.note("resumed", {})
         try:
             self.engine.put(line)
         except SessionError as error:
@@ -260,8 +262,8 @@ class LiveSession:
             self._ended_s = self._clock()
             self._judge()
             self._event("losses", self.losses())
-            if failure is not None:
-                self._message = failure
+            if failure is not None or self._state == "paused":
+                self._message = failure  # a scan that is over waits for nothing
             self._set_state("failed" if failure is not None else "stopped")
         with self._results_changed:
             self._results_changed.notify_all()
@@ -285,7 +287,9 @@ class LiveSession:
             if unless is not None and snapshot.version == unless:
                 return self._results
             results = judge(snapshot, self.settings.requirement(), self.source.geometry, self.source.towards_sensor)
-            self.engine.ask(lambda engine: self.verdicts.replace(results.verdict, engine.live_map)).result()
+            self.engine.ask(
+                lambda engine: self.verdicts.replace(results.verdict, snapshot.version, engine.live_map)
+            ).result()
         except SessionError:
             return None
         with self._results_changed:

@@ -32,9 +32,16 @@ class VerdictBook:
 
     def __init__(self) -> None:
         self._verdict = Verdict(np.zeros(0, dtype=np.bool_), np.zeros(0, dtype=np.uint8))
+        self._version = -1
 
-    def replace(self, verdict: Verdict, live_map: LiveMap) -> None:
-        """Take a new verdict; rows of which it says something new are announced with the next reading."""
+    def replace(self, verdict: Verdict, version: int, live_map: LiveMap) -> None:
+        """Take a verdict on that version of the map, unless a newer one is in force already.
+
+        Rows of which it says something new are announced with the next reading.
+        """
+        if version < self._version:
+            return
+        self._version = version
         old = self.of(np.arange(len(verdict.rescan), dtype=np.int32))
         differs = (old.rescan != verdict.rescan) | (old.reason != verdict.reason)
         live_map.touch(np.flatnonzero(differs).astype(np.int32))

@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import struct
+import time
 
 import numpy as np
 import pytest
@@ -172,6 +173,18 @@ def test_a_pulled_cable_pauses_the_scan_and_its_return_resumes_it(running, tmp_p
     assert wire["sent"] == wire["whole"] + wire["partial"] + sum(wire["lost"].values())
     events = service.client.get(f"/api/v1/sessions/{session_id}/events").json()["events"]
     assert [event["kind"] for event in events][:3] == ["interrupted", "reconnected", "resumed"]
+
+
+def test_a_scan_that_is_started_long_after_its_session_was_created_is_no_lost_scanner(running):
+    service, simulator = running.service(), running.simulator("plate")
+    session_id = service.create(**device(simulator))
+    time.sleep(1.5)  # longer than the driver takes a silence for a lost link
+    service.start(session_id)
+    assert service.status(session_id)["state"] == "scanning"
+    status = service.wait_for_state(session_id, "stopped")
+    assert status["message"] is None
+    events = service.client.get(f"/api/v1/sessions/{session_id}/events").json()["events"]
+    assert "interrupted" not in {event["kind"] for event in events}
 
 
 def test_a_session_survives_kill_9_with_everything_that_was_acknowledged(running):

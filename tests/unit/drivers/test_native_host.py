@@ -258,6 +258,13 @@ def test_a_device_that_falls_silent_is_noticed() -> None:
     assert bench.host.is_silent(bench.now_s)
 
 
+def test_the_silence_of_a_device_that_was_left_alone_counts_from_when_it_is_spoken_to_again() -> None:
+    bench = Bench().greet()
+    bench.run(30.0)
+    bench.host.arm(True, bench.now_s)
+    assert not bench.host.is_silent(bench.now_s)
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_on_a_bad_wire_every_chunk_is_accounted_for_and_the_pass_comes_to_its_end(seed: int) -> None:
