@@ -191,6 +191,7 @@ def snapshot_of(
         radius_mm=radius,
         radius_rule=np.full(n, RadiusRule.LINE_SPACING, np.uint8),
         neighbours=neighbours,
+        same_side=neighbours,
         density_per_mm2=neighbours / (np.pi * radius**2),
         normals=normals,
         unreliable=unreliable,
