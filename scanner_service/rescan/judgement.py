@@ -110,7 +110,7 @@ def judge(
     """
     line, n = snapshot.line, len(snapshot)
     required = requirement.per_mm2(strips.line_spacing_mm, strips.nominal_point_spacing_mm)
-    counted_density = border_aware(snapshot.density_per_mm2, snapshot.offset)
+    counted_density = border_aware(snapshot.side_density_per_mm2, snapshot.offset)
     judged = snapshot.settled & (snapshot.neighbours > 0) & np.isfinite(required)
 
     wall = np.zeros(n, dtype=bool)
@@ -130,7 +130,7 @@ def judge(
     # beyond this a neighbourhood no longer reaches the next line: Δs'/Δs > sqrt(2) + c/Δs
     beyond = (width * delta > strips.reach_mm[:, None] * stride) & (stride > 0) & ~(lost | fast)
     one_sided = ~(snapshot.offset < LEAST_OFFSET)
-    enough = (snapshot.density_per_mm2 >= required) & ~one_sided
+    enough = (snapshot.side_density_per_mm2 >= required) & ~one_sided
     failing = ((too_wide & ~enough[:, None]) | beyond) & judged[:, None]
     filled = _filled(snapshot, strips, failing, np.fmin(allowed, strips.reach_mm))
     failing &= ~filled

@@ -11,6 +11,7 @@ from fastapi import APIRouter, Query
 from starlette.background import BackgroundTask
 from starlette.responses import FileResponse, Response
 
+from scanner_service.analysis.expected import expected_density_per_mm2, expected_neighbours, surface_spacing_mm
 from scanner_service.analysis.snapshot import RadiusRule, Unreliable
 from scanner_service.api.answers import answer
 from scanner_service.api.errors import ExportUnknown, ValueUnusable
@@ -40,6 +41,9 @@ def list_points(
     results = results_of(session)
     points, verdict = results.snapshot, results.verdict
     part = slice(start, start + limit)
+    rows = np.arange(len(points), dtype=np.int32)[part]
+    along_mm = points.lines.point_spacing_mm[points.line[part]]
+    across_mm = surface_spacing_mm(points, rows, 20.0 * session.settings.uncertainty_mm)
     return answer(
         {
             "version": points.version,
@@ -51,6 +55,11 @@ def list_points(
             "radius_rule": [RadiusRule(rule).name.lower() for rule in points.radius_rule[part]],
             "neighbours": points.neighbours[part],
             "density_per_mm2": points.density_per_mm2[part],
+            "side_density_per_mm2": points.side_density_per_mm2[part],
+            "surface_spacing_mm": across_mm,
+            "expected_density_per_mm2": expected_density_per_mm2(across_mm, along_mm),
+            "expected_neighbours": expected_neighbours(points.radius_mm[part], across_mm, along_mm),
+            "normal_error_rad": points.normal_error_rad[part],
             "normals": points.normals[part],
             "unreliable": [Unreliable(reason).name.lower() for reason in points.unreliable[part]],
             "settled": points.settled[part],
