@@ -113,7 +113,8 @@ def tell(regions: list[dict[str, Any]], summary: dict[str, Any], out: Path) -> N
     console.print(
         f"{summary['points']:,} points in {summary['scanlines']:,} scanlines, "
         f"{summary['reliable_share']:.1%} with a reliable normal; "
-        f"observed coverage {'unknown' if coverage is None else format(coverage, '.1%')}",
+        f"observed coverage {'unknown' if coverage is None else format(coverage, '.1%')} "
+        f"({summary['coverage']['gap_mm2']:,.0f} mm² of walls and shadows were never seen)",
         highlight=False,
     )
     console.print(f"Written to {out}: {', '.join(OUTPUT_FILES)}", highlight=False, soft_wrap=True)

@@ -101,7 +101,8 @@ def _tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
     console.print(
         f"{summary['points']:,} points in {summary['scanlines']:,} scanlines, line spacing "
         f"{summary['line_spacing_mm']['median']:.3f} mm, radius {summary['radius_mm']['median']:.3f} mm, "
-        f"{summary['reliable_share']:.1%} with a reliable normal; observed coverage {share:.1%}",
+        f"{summary['reliable_share']:.1%} with a reliable normal; observed coverage {share:.1%} "
+        f"({summary['coverage']['gap_mm2']:,.0f} mm² of gaps)",
         highlight=False,
     )
     console.print(f"Written to {out}: {', '.join(OUTPUT_FILES)}", highlight=False, soft_wrap=True)
