@@ -1,11 +1,12 @@
 # Two commands matter: `make demo` and `make test`. Each sets up everything it needs in .venv.
 PYTHON ?= python3
 OUT ?= out
+JSON ?= $(OUT)/live-map.json
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: demo test test-long lint clean
+.PHONY: demo test test-long lint bench clean
 .DELETE_ON_ERROR:
 
 $(VENV)/installed: pyproject.toml
@@ -26,6 +27,11 @@ test: $(VENV)/installed-dev
 
 test-long: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m long --timeout 3600 $(ARGS)
+
+# Open3D is large, and wanted here only; JSON=FILE chooses where the figures go.
+bench: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
+	$(BIN)/scanner bench live-map --json $(JSON) $(ARGS)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .

@@ -6,6 +6,7 @@ import typer
 
 from scanner_service import __version__
 from scanner_service.commands.analyse import analyse_command
+from scanner_service.commands.bench import bench_app
 from scanner_service.commands.demo import demo_command
 from scanner_service.commands.replay import replay_command
 from scanner_service.commands.serve import DEFAULT_DATA, serve_command
@@ -23,6 +24,7 @@ app.command("demo")(demo_command)
 app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)
 app.command("simulate")(simulate_command)
+app.add_typer(bench_app, name="bench")
 
 
 def _tell_version(wanted: bool) -> None:

@@ -1,0 +1,61 @@
+"""`scanner bench`: the benchmarks that stand beside the project; knows where they are, measures nothing itself."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import scanner_service
+from scanner_service.commands.terminal import fail
+
+bench_app = typer.Typer(help="Measure how fast the service is, beside the tools that people use today.")
+
+
+@bench_app.callback()
+def _bench() -> None:
+    """Keep `live-map` a command of its own, although there is no other yet."""
+
+
+@bench_app.command("live-map")
+def live_map_command(
+    json_file: Annotated[Path | None, typer.Option("--json", help="File for the figures.")] = None,
+    points: Annotated[int, typer.Option(min=1, help="Points of a run; 20000000 for a release.")] = 2_000_000,
+    repeats: Annotated[int, typer.Option(min=1, help="Rounds; medians are reported.")] = 3,
+    threads: Annotated[list[int] | None, typer.Option(min=1, help="Number of threads; repeat it for more.")] = None,
+    checks: Annotated[int, typer.Option(min=0, help="Random lines at which the oracle is asked.")] = 20,
+    without_peers: Annotated[bool, typer.Option("--without-peers", help="Leave Open3D and scipy out.")] = False,
+    one_radius: Annotated[bool, typer.Option("--one-radius", help="Leave 2r and 4r out.")] = False,
+    warm_only: Annotated[bool, typer.Option("--warm-only", help="Leave the cold start out.")] = False,
+) -> None:
+    """Measure the live map and its peers by turns, print ratios, save JSON; takes some minutes."""
+    root = project_root()
+    if root is None:
+        fail(
+            "The benchmarks are not part of the installed package: clone the project and run "
+            "`scanner bench live-map` from there, installed with `pip install --editable '.[bench]'`."
+        )
+    command = [sys.executable, "-m", "benchmarks.live_map", "--points", str(points), "--repeats", str(repeats)]
+    command += ["--checks", str(checks)]
+    if json_file is not None:
+        command += ["--json", str(json_file.absolute())]
+    if threads:
+        command += ["--threads", *map(str, threads)]
+    for flag, is_wanted in (
+        ("--without-peers", without_peers),
+        ("--one-radius", one_radius),
+        ("--warm-only", warm_only),
+    ):
+        if is_wanted:
+            command.append(flag)
+    done = subprocess.run(command, cwd=root, check=False)
+    if done.returncode != 0:
+        raise typer.Exit(1)
+
+
+def project_root() -> Path | None:
+    """The checkout that this package runs from; None when it was installed without one."""
+    root = Path(scanner_service.__file__).resolve().parent.parent
+    is_checkout = (root / "benchmarks" / "live_map.py").is_file() and (root / "tests" / "oracle.py").is_file()
+    return root if is_checkout else None
