@@ -8,6 +8,7 @@ from scanner_service import __version__
 from scanner_service.commands.analyse import analyse_command
 from scanner_service.commands.bench import bench_app
 from scanner_service.commands.demo import demo_command
+from scanner_service.commands.open_viewer import open_command
 from scanner_service.commands.replay import replay_command
 from scanner_service.commands.serve import DEFAULT_DATA, serve_command
 from scanner_service.commands.simulate import simulate_command
@@ -20,6 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("serve")(serve_command)
+app.command("open")(open_command)
 app.command("demo")(demo_command)
 app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)

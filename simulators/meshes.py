@@ -155,6 +155,8 @@ def load_mesh(path: Path, scale_to_mm: float = 1.0, part_from_mesh: Pose | None 
         raise MeshUnreadable(f"{path} is not a mesh this simulator reads; give a file ending in .stl, .obj or .ply")
     if not path.is_file():
         raise MeshUnreadable(f"there is no mesh file {path}")
+    if path.suffix.lower() == ".stl" and not _stl_is_whole(path):
+        raise MeshUnreadable(f"{path} is damaged: its length is not what its header says; write it anew and try again")
     try:
         # Unprocessed, so that no vertex is merged or moved.
         mesh = trimesh.load_mesh(path, process=False)
@@ -164,3 +166,13 @@ def load_mesh(path: Path, scale_to_mm: float = 1.0, part_from_mesh: Pose | None 
     if not len(faces):
         raise MeshEmpty(f"{path} holds no triangles; is it a point cloud?")
     return TriangleMesh(vertices * scale_to_mm, faces, Pose.identity() if part_from_mesh is None else part_from_mesh)
+
+
+def _stl_is_whole(path: Path) -> bool:
+    """False for a binary STL whose length contradicts its count; readers differ in what they make of such a wreck."""
+    with path.open("rb") as file:
+        head = file.read(84)
+    if head.startswith(b"solid") or len(head) < 84:  # text, or left to the reader
+        return True
+    (triangles,) = struct.unpack_from("<I", head, 80)
+    return bool(path.stat().st_size == 84 + 50 * triangles)

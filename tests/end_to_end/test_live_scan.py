@@ -4,8 +4,11 @@ import contextlib
 import io
 import json
 import struct
+import subprocess
+import sys
 import time
 
+import httpx
 import numpy as np
 import pytest
 import websockets.exceptions
@@ -309,10 +312,19 @@ def test_a_withdrawn_pass_leaves_the_map_and_stays_in_the_record(running):
     assert (after["points_counted"], after["unreliable"]) == (300, before["unreliable"])
 
 
+def test_a_fresh_one_time_address_opens_the_viewer_once(running):
+    service = running.service()
+    command = [sys.executable, "-m", "scanner_service", "open", "--data", service.data, "--url", service.url, "--json"]
+    told = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    address = json.loads(told.stdout)["viewer"]
+    first = httpx.get(address)
+    assert (first.status_code, first.headers["location"]) == (303, "/")
+    assert "HttpOnly" in first.headers["set-cookie"]
+    assert httpx.get(address).status_code == 401
+
+
 def test_nothing_is_told_without_a_key(running):
     service = running.service()
-    import httpx
-
     for path in ("/api/v1/sessions", "/metrics"):
         assert httpx.get(service.url + path).status_code == 401
     assert httpx.get(service.url + "/healthz").json() == {"status": "ok"}
