@@ -78,7 +78,8 @@ class MapSettings:
 class Accepted:
     """What became of one line: its row in the line table, its radius, and how many of its points count.
 
-    `left_out` counts points that are kept in the record but not in the map, by reason: `stationary`, `over_dense`.
+    `left_out` counts points that are kept in the record but not in the map, by reason: `stationary`,
+    `over_dense`, `withdrawn` (a line of a pass that was taken out before).
     """
 
     line_row: int
@@ -168,16 +169,17 @@ class LiveMap:
         self.can_take(line)
         of = self._passes.enter(line)
         stationary = of.slot >= 0 and of.stands_still_at(line)
+        passed_over = "withdrawn" if of.is_withdrawn else "stationary" if stationary else None
         first, last = self._used, self._used + len(line.index)
         row = self._lines.append(line, of, spacing, stationary, first, self.origin_mm)
-        said = Unreliable.NOT_COUNTED if stationary else Unreliable.TOO_FEW
+        said = Unreliable.TOO_FEW if passed_over is None else Unreliable.NOT_COUNTED
         radii = np.array([common]) if radius_mm is None else np.ascontiguousarray(radius_mm, dtype=np.float64)
         write_points(self._points, first, line.xyz_q, line.index, radii, int(rule), int(said))
         self._used = last
-        if stationary:
+        if passed_over is not None:
             self._grid_rows = last
             self._pending.append(np.arange(first, last, dtype=np.int32))
-            return Accepted(row, common, 0, {"stationary": last - first} if last > first else {})
+            return Accepted(row, common, 0, {passed_over: last - first} if last > first else {})
         if of.slot >= 0:
             self._follow(of, line)
         if self._rules.is_flexible or self._global is not None:
@@ -204,7 +206,7 @@ class LiveMap:
         withdrawn has nothing to take out.
         """
         self.close_pass(key)
-        number = self._passes.number_of(key)
+        number = self._passes.withdraw(key)
         if number is None:
             return 0
         count = 0

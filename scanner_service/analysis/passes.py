@@ -37,6 +37,7 @@ class Pass:
     direction: int = 0
     front_mm: float = math.nan
     stations: dict[int, list[float]] = field(default_factory=dict)
+    is_withdrawn: bool = False
 
     def stands_still_at(self, line: StoredLine) -> bool:
         """True when an accepted line of the pass lies closer than a quarter of the line spacing along the travel."""
@@ -124,10 +125,13 @@ class PassBook:
         self._free.append(slot)
         return Pass(closed.number, slot, closed.normal)
 
-    def number_of(self, key: PassKey) -> int | None:
-        """The number of a pass, open or closed; None when it is unknown."""
+    def withdraw(self, key: PassKey) -> int | None:
+        """Mark a closed pass as withdrawn; its number, or None when it is unknown or was withdrawn before."""
         known = self._passes.get(key)
-        return None if known is None else known.number
+        if known is None or known.is_withdrawn:
+            return None
+        known.is_withdrawn = True
+        return known.number
 
     def open_keys(self) -> list[PassKey]:
         """The passes that are open, in the order they were opened."""

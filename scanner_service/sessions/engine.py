@@ -113,6 +113,13 @@ class Engine:
         self.ledger.arrived()
         self.ledger.decided("stored")
 
+    def withdraw_pass(self, key: PassKey) -> int:
+        """Take a pass out of the map; returns how many points that were."""
+        points = self.live_map.withdraw_pass(key)
+        if points:
+            self.ledger.withdrawn(points)
+        return points
+
     def close_passes(self) -> None:
         """Close every pass: what was scanned is settled."""
         self.live_map.close_all_passes()

@@ -59,6 +59,12 @@ class Ledger:
             self.counted += accepted.counted
             self.left_out.update(accepted.left_out)
 
+    def withdrawn(self, points: int) -> None:
+        """Points of a withdrawn pass were taken out of the map again."""
+        with self._lock:
+            self.counted -= points
+            self.left_out["withdrawn"] += points
+
     def to_dict(self, device: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """As the API, the summary and the viewer show it; `device` is the driver's own tally of chunks and lines."""
         with self._lock:

@@ -95,7 +95,7 @@ class LiveSession:
             self.engine.restore(line)
             on_progress(number)
         for key in withdrawn_passes(self._record.events(self.row.session_id)):
-            self.engine.live_map.withdraw_pass(key)
+            self.engine.withdraw_pass(key)
         if damaged:
             self._message = f"{len(damaged)} stored lines are damaged and left out; the first: {damaged[0]}"
         if self._state in ("stopped", "failed", "interrupted"):
@@ -147,7 +147,7 @@ class LiveSession:
 
         Returns how many points that were; 0, and nothing recorded, when the pass is unknown or withdrawn already.
         """
-        count = self.engine.ask(lambda engine: engine.live_map.withdraw_pass(key)).result()
+        count = self.engine.ask(lambda engine: engine.withdraw_pass(key)).result()
         if count:
             self._event(WITHDRAWN, {"device_id": key[0], "boot_id": key[1], "pass_index": key[2], "points": count})
             self._judge()

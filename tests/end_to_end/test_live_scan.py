@@ -300,7 +300,9 @@ def test_a_withdrawn_pass_leaves_the_map_and_stays_in_the_record(running):
     service.client.post(f"{session}/scanlines", json={"lines": lines})
     second = {"device_id": "client", "boot_id": 0, "pass_index": 1}
     assert service.client.post(f"{session}/passes/withdraw", json=second).json()["withdrawn_points"] == 300
-    assert service.client.post(f"{session}/passes/withdraw", json=second).json()["withdrawn_points"] == 0
+    again = service.client.post(f"{session}/passes/withdraw", json=second).json()
+    assert (again["withdrawn_points"], again["points"]) == (0, 300)
+    assert again["losses"]["points"]["left_out"] == {"withdrawn": 300}
     service.client.post(f"{session}/stop")
     before = service.client.get(f"{session}/summary").json()
     assert (before["points"], before["points_counted"]) == (600, 300)

@@ -14,6 +14,7 @@ from benchmarks.cloud import NOISE_MM, RADIUS_MM, make_lines
 from benchmarks.live_run import Plan, settings_for
 from benchmarks.peers import scipy_everything
 from benchmarks.reader import Reader
+from benchmarks.summary import summarise
 from scanner_service.analysis.intake import QUANTUM_MM
 from scanner_service.analysis.live_map import LiveMap
 from scanner_service.cli import app
@@ -45,7 +46,9 @@ def small_scan():
 
 def test_a_run_writes_every_key_and_agrees_with_the_oracle(tmp_path):
     file = tmp_path / "figures" / "live-map.json"
-    arguments = "--points 50000 --repeats 1 --threads 1 --checks 4 --without-peers --one-radius --warm-only"
+    arguments = (
+        "--points 50000 --repeats 1 --threads 1 --checks 4 --without-peers --one-radius --warm-only --patience-s 0"
+    )
     assert bench.main([*arguments.split(), "--json", str(file)]) == 0
     result = json.loads(file.read_text())
     figures = result["threads"]["1"]
@@ -116,6 +119,24 @@ def test_scipy_as_a_peer_gives_what_the_oracle_gives():
         assert counts[row] == truth.neighbours
         if truth.is_comparable:
             assert normals[row] == pytest.approx(truth.normal, abs=1e-6)
+
+
+def test_figures_come_from_the_quiet_rounds_and_ratios_from_figures():
+    def ran(points_per_s, others):
+        return {"points_per_s": points_per_s, "cores_taken_by_others": others, "bytes_per_point": 1.0} | cost
+
+    cost = {"p50_s": 1.0, "p99_s": 2.0, "max_s": 3.0, "last_to_first_tenth": 1.0}
+    rounds = {
+        ("reader", 2): [ran(8.0, 0.0), ran(1.0, 1.0), ran(4.0, 0.1)],
+        ("each_line", 2): [ran(2.0, 0.9), ran(1.0, 1.1)],
+        ("open3d", 2): [ran(3.0, 0.0)],
+    }
+    figures = summarise(rounds)["2"]
+    assert figures["points_per_s"] == 6.0
+    assert figures["ratio_open3d"] == 2.0
+    assert figures["ratio_scipy"] is None
+    assert figures["points_per_s_each_line"] == 1.5
+    assert figures["cases"]["each_line"]["quiet_rounds"] == 0
 
 
 def test_more_threads_than_cores_are_refused(capsys):

@@ -67,6 +67,16 @@ def test_a_withdrawn_pass_leaves_a_map_that_never_had_it_bit_for_bit(seed, read_
     assert gone.sum() == counted
 
 
+def test_a_line_that_comes_after_its_pass_was_withdrawn_stays_out():
+    live = new_map()
+    lines = surface_scan(lambda x, y: 0 * x)
+    for line in lines[:-1]:
+        live.add(line)
+    live.withdraw_pass(pass_key(lines[0]))
+    assert live.add(lines[-1]).left_out == {"withdrawn": 30}
+    assert (live.snapshot().neighbours == 0).all()
+
+
 def test_withdrawing_what_was_never_there_changes_nothing():
     live = new_map()
     for line in surface_scan(lambda x, y: 0 * x):
