@@ -8,10 +8,10 @@ from pathlib import Path
 
 from prometheus_client import CollectorRegistry
 
-from scanner_service.analysis.warm_up import kernels_are_ready, warm_up
 from scanner_service.api.access import Access
 from scanner_service.api.metrics import metrics_of
 from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.readiness import kernels_are_ready, warm_up
 from scanner_service.storage.record import Record
 
 

@@ -21,8 +21,8 @@ from scanner_service.storage.errors import RecordError
 from scanner_service.storage.exports.errors import ExportError
 from scanner_service.storage.formats.errors import FormatError
 
-console = Console()
-errors = Console(stderr=True)
+console = Console(markup=False)  # what is told may hold brackets: paths, names, extras of a package
+errors = Console(stderr=True, markup=False)
 EXPECTED = (
     DriverError,
     KeyStoreError,

@@ -65,6 +65,9 @@ class SessionBook:
         SessionUnknown : there is none.
         SessionBusy : too many sessions are open.
         """
+        live = self._live.get(session_id)
+        if live is not None:  # nobody waits here for another session that is being reopened
+            return live
         with self._lock:
             live = self._live.get(session_id)
             if live is not None:

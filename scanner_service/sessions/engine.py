@@ -62,6 +62,7 @@ class Engine:
         self._seen: set[tuple[str, int, int]] = set()
         self._open: dict[str, PassKey] = {}
         self._inbox: queue.Queue[_Line | _Ask | None] = queue.Queue(INBOX_LINES)
+        self._has_ended = False  # set before the inbox is emptied for the last time: see `_hand_over`
         self._thread = threading.Thread(target=self._run, name=f"engine-{session_id}", daemon=True)
         self.busy_s = 0.0
 
@@ -73,19 +74,17 @@ class Engine:
 
     def close(self) -> None:
         """Take what is in the inbox, then end; idempotent."""
-        if self._thread.is_alive():
-            self._inbox.put(None)
+        if self._hand_over(None):
             self._thread.join()
-        self._refuse_the_rest()
 
     def put(self, line: Scanline | StoredLine, reply: "Future[Stored] | None" = None) -> None:
         """Hand over a scanline, or one out of a record; waits while the inbox is full, so that the source holds it."""
-        if self.failure is not None or not self._thread.is_alive():
-            raise SessionNotLive(self.failure or "the session is closed and takes no scanlines")
+        if reply is not None:
+            reply.set_running_or_notify_cancel()  # what is in the inbox cannot be called back
         self.ledger.arrived()
-        message = _Line(line, reply)
-        if not self._hand_over(message):
-            self._refuse(message, "too_late", self.failure or "the session was closed before the line's turn came")
+        if not self._hand_over(_Line(line, reply)):
+            self.ledger.decided("too_late")
+            raise SessionNotLive(self.failure or "the session is closed and takes no scanlines")
 
     def ask(self, question: "Callable[[Engine], T]") -> "Future[T]":
         """Have a question answered on the engine's thread, after everything put before it."""
@@ -94,13 +93,15 @@ class Engine:
             reply.set_exception(SessionNotLive(self.failure or "the session is closed"))
         return reply
 
-    def _hand_over(self, message: "_Line | _Ask") -> bool:
+    def _hand_over(self, message: "_Line | _Ask | None") -> bool:
         """Put a message into the inbox, waiting while it is full; False when the engine has ended."""
-        while self._thread.is_alive():
+        while self._thread.is_alive() and not self._has_ended:
             try:
                 self._inbox.put(message, timeout=0.5)
             except queue.Full:
                 continue
+            if self._has_ended:  # perhaps too late for the engine to see it: nobody may be left waiting
+                self._refuse_the_rest()
             return True
         return False
 
@@ -141,6 +142,7 @@ class Engine:
                 self.failure = f"the session stopped by an internal fault: {error}"
                 break
             self.busy_s += self._clock() - begun
+        self._has_ended = True
         self._refuse_the_rest()
         self.live_map.close()
 
@@ -213,5 +215,5 @@ class Engine:
                 return
             if isinstance(message, _Line):
                 self._refuse(message, "too_late", self.failure or "the session was closed before the line's turn came")
-            elif isinstance(message, _Ask):
+            elif isinstance(message, _Ask) and message.reply.set_running_or_notify_cancel():
                 message.reply.set_exception(SessionNotLive(self.failure or "the session is closed"))

@@ -13,9 +13,9 @@ import numpy as np
 from drivers.scanline import Scanline
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey
-from scanner_service.analysis.warm_up import warm_up
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionBusy, SessionError
+from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.sources import PushSource, Source
@@ -136,11 +136,12 @@ class LiveSession:
         """
         if not isinstance(self.source, PushSource):
             raise SessionBusy("this session reads from a source of its own and takes no pushed scanlines")
-        if self._state != "scanning":
-            raise SessionBusy(f"the session is {self._state}: start it before pushing scanlines")
-        reply: Future[Stored] = Future()
-        self.engine.put(line, reply)
-        return reply
+        with self._lock:  # a line is before the end of the scan, and judged, or refused
+            if self._state != "scanning":
+                raise SessionBusy(f"the session is {self._state}: start it before pushing scanlines")
+            reply: Future[Stored] = Future()
+            self.engine.put(line, reply)
+            return reply
 
     def withdraw_pass(self, key: PassKey) -> int:
         """Take a pass out of the map; the raw lines and the withdrawal itself stay in the record.
@@ -170,13 +171,14 @@ class LiveSession:
     # -- what a source says (Sink) ------------------------------------------------------------------------------
 
     def line(self, line: Scanline | StoredLine) -> None:
-        """A scanline from the source; lines that come when the engine is gone are counted by it."""
+        """A scanline from the source; when the engine is gone, it is counted there and the source is told to stop."""
         if self._state == "paused":  # lines flow again, whatever was or was not said of the link
             self.note("resumed", {})
         try:
             self.engine.put(line)
         except SessionError as error:
             _LOG.warning("a scanline of session %s was not taken: %s", self.row.session_id, error)
+            self.source.stop()
 
     def note(self, kind: str, details: dict[str, Any]) -> None:
         """An event from the source: goes into the record, and may pause or resume the session."""
@@ -203,7 +205,7 @@ class LiveSession:
         """The latest verdict; None before the first."""
         return self._results
 
-    def fresh_results(self, timeout_s: float = 120.0) -> Results:
+    def fresh_results(self) -> Results:
         """A verdict on everything that was put in before this call."""
         results = self._judge()
         if results is None:
@@ -211,11 +213,9 @@ class LiveSession:
         return results
 
     def wait_until_over(self, timeout_s: float | None = None) -> bool:
-        """Wait until the session is stopped or failed and judged; False when it is not after `timeout_s`."""
+        """Wait until the session is stopped or failed, and judged if it can be; False when not after `timeout_s`."""
         with self._results_changed:
-            return self._results_changed.wait_for(
-                lambda: self._state in ("stopped", "failed") and self._results is not None, timeout_s
-            )
+            return self._results_changed.wait_for(lambda: self._state in ("stopped", "failed"), timeout_s)
 
     def elapsed_s(self) -> float:
         """Seconds from the start of the scan to its end, or to now."""
@@ -254,11 +254,17 @@ class LiveSession:
     # -- inside -------------------------------------------------------------------------------------------------
 
     def _finish(self, failure: str | None) -> None:
-        """Close the passes and judge for the last time; the state changes when the verdict is there."""
+        """Close the passes and judge for the last time; the state changes when the verdict is there.
+
+        An engine that was ended by a fault can do neither: then the session has failed, with what was judged before.
+        """
         with self._lock:
             if self._state in ("stopped", "failed"):
                 return
-            self.engine.ask(lambda engine: engine.close_passes()).result()
+            try:
+                self.engine.ask(lambda engine: engine.close_passes()).result()
+            except SessionError as error:
+                failure = failure or str(error)
             self._ended_s = self._clock()
             self._judge()
             self._event("losses", self.losses())
@@ -278,7 +284,7 @@ class LiveSession:
                 before = seen
                 results = self._judge(unless=before)
                 seen = results.snapshot.version if results is not None else seen
-            period_s = max(ANALYSIS_PERIOD_S, 4.0 * (self._clock() - begun_s))
+            period_s = max(ANALYSIS_PERIOD_S, 2.0 * (self._clock() - begun_s))
 
     def _judge(self, unless: int | None = None) -> Results | None:
         """Take a snapshot, judge it, and put the verdict in force; None when the engine is gone."""

@@ -42,8 +42,11 @@ class DeviceSpec:
 
     def open(self) -> Source:
         """Open the port and greet the scanner; raises a DriverError when that fails, SourceUnusable for a bad path."""
-        path = Path(self.port)
-        if not str(path.resolve()).startswith(_PORT_PREFIXES):
+        try:
+            path = Path(self.port).resolve()
+        except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a NUL, half a character
+            raise SourceUnusable(f"{self.port!r} is not the path of a port: {error}") from error
+        if not str(path).startswith(_PORT_PREFIXES):
             raise SourceUnusable(f"{self.port} is not a serial device: name one such as /dev/ttyUSB0")
         scanner = NativeScanner(self.port, self.baud_rate)
         info = scanner.enter()
@@ -69,8 +72,6 @@ class ReplaySpec:
 
     def open(self, recording: Recording | None = None) -> Source:
         """A source that plays the file, or the recording that was read from it; raises FormatError, SourceUnusable."""
-        if self.speed is not None and not (math.isfinite(self.speed) and self.speed > 0):
-            raise SourceUnusable(f"the speed of a replay must be greater than 0, not {self.speed}")
         recording = recording or self.read()
         accounts = {"points_declared": recording.points_declared, "dropped": dict(recording.dropped)}
         return ReplaySource(recording.lines, len(recording.lines), accounts, self.speed)
@@ -99,7 +100,10 @@ class RecordSpec:
         return cls(reader, newest[0], speed)
 
     def open(self) -> Source:
-        """A source that plays the stored lines as they are, without the passes that were withdrawn."""
+        """A source that plays the stored lines as they are, without the passes that were withdrawn.
+
+        Raises SourceUnusable.
+        """
         gone = withdrawn_passes(self.reader.events(self.session.session_id))
         lines = (line for _, line in self.reader.lines(self.session.session_id) if pass_key(line) not in gone)
         return ReplaySource(lines, self.reader.count(self.session.session_id).lines, None, self.speed)

@@ -4,6 +4,7 @@ A source runs its own thread and hands frozen scanlines to a `Sink`; it knows no
 """
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -102,9 +103,12 @@ class DeviceSource:
     def stop(self) -> None:
         """Stop the pass, switch the laser off and close the port."""
         self._stopping.set()
+        if self._thread is None:  # never started: nobody else lets go of the port
+            self._scanner.exit()
+            return
         with contextlib.suppress(DriverError):  # the device may be gone: then there is nothing left to stop
             self._scanner.stop_pass()
-        if self._thread is not None and self._thread is not threading.current_thread():
+        if self._thread is not threading.current_thread():
             self._thread.join()
 
     def tally(self) -> dict[str, Any] | None:
@@ -162,7 +166,8 @@ class DeviceSource:
 class ReplaySource:
     """Recorded scanlines, played as fast as they are taken or at `speed` times the pace of their device times.
 
-    `accounts` is what the file held and what of it could not be used, `line_count` how many lines there are.
+    `accounts` is what the file held and what of it could not be used, `line_count` how many lines there are. Raises
+    SourceUnusable when `speed` is not a pace.
     """
 
     def __init__(
@@ -173,6 +178,8 @@ class ReplaySource:
         speed: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        if speed is not None and not (math.isfinite(speed) and speed > 0):
+            raise SourceUnusable(f"the speed of a replay must be greater than 0, not {speed}")
         self.geometry: SensorGeometry | None = None
         self.towards_sensor: Float64Array | None = None
         self._lines = lines
@@ -217,6 +224,8 @@ class ReplaySource:
                     break
                 sink.line(line)
                 self._played += 1
+            else:
+                self._line_count = self._played  # a record may hold lines of withdrawn passes, which are not played
         except RecordError as error:
             failure = str(error)
         sink.ended(failure)

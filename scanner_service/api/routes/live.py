@@ -18,14 +18,14 @@ from scanner_service.sessions.errors import SessionError
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.sources import PushSource
-from scanner_service.storage.errors import RecordError
+from scanner_service.storage.errors import RecordError, SessionUnknown
 
 router = APIRouter()
 UPDATE_PERIOD_S = 1 / 30
 STATUS_PERIOD_S = 0.5
 MAX_CREDIT = 64
-MAX_REQUEST_BYTES = 1024
-FINISHED, GOING_AWAY, POLICY, NOT_FOUND = 1000, 1001, 1008, 4404
+MAX_REQUEST_CHARACTERS = 1024
+FINISHED, GOING_AWAY, POLICY, TRY_AGAIN_LATER, NOT_FOUND = 1000, 1001, 1008, 1013, 4404
 
 
 class _Credit:
@@ -53,7 +53,7 @@ async def live(websocket: WebSocket, session_id: str) -> None:
         session = await run_in_threadpool(websocket.app.state.service.book.get, session_id)
     except (RecordError, SessionError) as error:
         await _say(websocket, {"type": "error", "detail": str(error)})
-        await websocket.close(NOT_FOUND)
+        await websocket.close(NOT_FOUND if isinstance(error, SessionUnknown) else TRY_AGAIN_LATER)
         return
     credit, greeted = _Credit(), asyncio.Event()
     listening = asyncio.create_task(_listen(websocket, credit))
@@ -62,10 +62,12 @@ async def live(websocket: WebSocket, session_id: str) -> None:
         asyncio.create_task(_send_points(websocket, session, credit, greeted)),
     ]
     all_sent = asyncio.gather(*sending)
-    done, _ = await asyncio.wait((listening, all_sent), return_when=asyncio.FIRST_COMPLETED)
-    for task in (listening, *sending):
-        task.cancel()
-    await asyncio.gather(listening, *sending, all_sent, return_exceptions=True)
+    try:
+        done, _ = await asyncio.wait((listening, all_sent), return_when=asyncio.FIRST_COMPLETED)
+    finally:  # also when the server ends this task
+        for task in (listening, *sending):
+            task.cancel()
+        await asyncio.gather(listening, *sending, all_sent, return_exceptions=True)
     ended = listening if listening in done else all_sent
     await _part(websocket, ended.exception())
 
@@ -79,12 +81,10 @@ def _is_final(session: LiveSession) -> bool:
 async def _part(websocket: WebSocket, error: BaseException | None) -> None:
     """Say why the stream ends, when there is somebody left to be told."""
     match error:
-        case SessionError():
-            await _say(websocket, {"type": "error", "detail": str(error)})
-            await websocket.close(GOING_AWAY)
-        case ValueError():
-            await _say(websocket, {"type": "error", "detail": str(error)})
-            await websocket.close(POLICY)
+        case SessionError() | ValueError():
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                await _say(websocket, {"type": "error", "detail": str(error)})
+                await websocket.close(GOING_AWAY if isinstance(error, SessionError) else POLICY)
         case None:
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                 await websocket.close(FINISHED)
@@ -97,10 +97,13 @@ async def _part(websocket: WebSocket, error: BaseException | None) -> None:
 async def _listen(websocket: WebSocket, credit: _Credit) -> None:
     """Take grants of credit; anything else ends the connection."""
     while True:
-        text = await websocket.receive_text()
+        received = await websocket.receive()
+        if received["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(received.get("code", GOING_AWAY))
+        text = received.get("text")  # None: a binary message
         try:
-            message = json.loads(text) if len(text) <= MAX_REQUEST_BYTES else None
-        except ValueError:
+            message = json.loads(text) if text is not None and len(text) <= MAX_REQUEST_CHARACTERS else None
+        except (ValueError, RecursionError):
             message = None
         more = message.get("credit") if isinstance(message, dict) else None
         if not isinstance(more, int) or isinstance(more, bool) or more < 1:

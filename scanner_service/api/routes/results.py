@@ -8,8 +8,8 @@ from typing import Annotated
 
 import numpy as np
 from fastapi import APIRouter, Query
-from starlette.background import BackgroundTask
 from starlette.responses import FileResponse, Response
+from starlette.types import Receive, Scope, Send
 
 from scanner_service.analysis.expected import expected_density_per_mm2, expected_neighbours, surface_spacing_mm
 from scanner_service.analysis.snapshot import RadiusRule, Unreliable
@@ -118,15 +118,23 @@ def export(session: Session, file_name: str) -> Response:
     if file_name not in OUTPUT_FILES:
         raise ExportUnknown(f"there is no export {file_name}; ask for one of {', '.join(OUTPUT_FILES)}")
     folder = Path(tempfile.mkdtemp(prefix="scanner-export-"))
-    forget = BackgroundTask(shutil.rmtree, folder)
     try:
         write_output(file_name, folder / file_name, session, results_of(session))
     except BaseException:
         shutil.rmtree(folder)
         raise
-    return FileResponse(
+    return _PassingFile(
         folder / file_name,
         media_type=MEDIA_TYPES[Path(file_name).suffix],
         filename=f"{session.row.session_id}-{file_name}",
-        background=forget,
     )
+
+
+class _PassingFile(FileResponse):
+    """A file whose folder is removed after the answer, whatever that was: a background task is not run for each."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            shutil.rmtree(Path(self.path).parent, ignore_errors=True)

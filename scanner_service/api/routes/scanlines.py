@@ -23,10 +23,9 @@ async def push_scanlines(session: Session, body: ScanlinesIn) -> Response:
 
     Pushing the same lines again is safe: they are answered as `duplicate`.
     """
-    lines = [line.to_scanline() for line in body.lines]
 
     def push() -> "list[Future[Stored]]":
-        return [session.push(line) for line in lines]
+        return [session.push(line.to_scanline()) for line in body.lines]
 
     futures = await run_in_threadpool(push)
     outcomes = await asyncio.gather(*(asyncio.wrap_future(future) for future in futures), return_exceptions=True)
@@ -34,7 +33,7 @@ async def push_scanlines(session: Session, body: ScanlinesIn) -> Response:
         {"line_index": line.line_index, "outcome": outcome.outcome, "line_number": outcome.line_number}
         if isinstance(outcome, Stored)
         else {"line_index": line.line_index, "outcome": "refused", "detail": str(outcome)}
-        for line, outcome in zip(lines, outcomes, strict=True)
+        for line, outcome in zip(body.lines, outcomes, strict=True)
     ]
     return answer({"lines": results}, 200 if all(isinstance(outcome, Stored) for outcome in outcomes) else 409)
 

@@ -12,6 +12,7 @@ from scanner_service.api.keys import Role
 from scanner_service.api.schemas import DeviceSourceIn, PassIn, PushSourceIn, ReplaySourceIn, SessionIn
 from scanner_service.api.scopes import require
 from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, ReplaySpec, SourceSpec
 from scanner_service.storage.formats.recording import ReadOptions
@@ -41,6 +42,8 @@ def spec_of(source: DeviceSourceIn | ReplaySourceIn | PushSourceIn, replay_dir: 
         case DeviceSourceIn():
             return DeviceSpec(**source.model_dump(exclude={"kind"}))
         case ReplaySourceIn():
+            if not (replay_dir / source.file).is_file():
+                raise SourceUnusable(f"there is no file {source.file} in the service's replay folder")
             options = ReadOptions(units=source.units, laser_mm=source.laser_mm, line_spacing_mm=source.line_spacing_mm)
             return ReplaySpec(replay_dir / source.file, options, source.speed)
         case PushSourceIn():
@@ -144,7 +147,7 @@ def delete_session(request: Request, session_id: str) -> Response:
 
 @router.get("/{session_id}/events", dependencies=[viewer])
 def list_events(
-    request: Request, session_id: str, after: int = -1, limit: Annotated[int, Query(ge=1, le=1000)] = 100
+    request: Request, session_id: str, after: Annotated[int, Query(ge=-1, lt=2**63)] = -1, limit: Annotated[int, Query(ge=1, le=1000)] = 100
 ) -> Response:
     """What happened in the session, in order."""
     found = []

@@ -1,0 +1,49 @@
+"""Compiling the kernels of the live map on a few points, before the first scanline; knows no service."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from scanner_service.analysis.intake import StoredLine
+from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.radius import LiveRule, RadiusSettings
+from scanner_service.analysis.snapshot import MapSnapshot
+
+
+def compile_kernels() -> MapSnapshot:
+    """Compile every kernel, or load it from the cache; returns a small map for whoever has kernels of their own."""
+    rules: tuple[LiveRule, ...] = ("global", "flexible", "line")
+    for rule in rules:
+        live_map = LiveMap(MapSettings(radius=RadiusSettings(rule=rule), max_points=4096))
+        for number in range(4):
+            live_map.add(_line(number))
+            live_map.refresh()
+        live_map.add(_line(1, line_index=9, position_mm=0.21))
+        live_map.add(replace(_line(5), pass_index=1))
+        live_map.withdraw_pass(("warm-up", 0, 1))
+        live_map.snapshot()
+        live_map.close_all_passes()
+    return live_map.snapshot()
+
+
+def _line(number: int, line_index: int | None = None, position_mm: float | None = None) -> StoredLine:
+    position = 0.2 * number if position_mm is None else position_mm
+    xyz_q = np.zeros((12, 3), dtype=np.int32)
+    xyz_q[:, 0] = np.arange(12) * 1000
+    xyz_q[:, 1] = round(position * 8192)
+    return StoredLine(
+        device_id="warm-up",
+        boot_id=0,
+        pass_index=0,
+        line_index=number if line_index is None else line_index,
+        device_time_s=0.0,
+        xyz_q=xyz_q,
+        index=np.arange(12, dtype=np.int32),
+        point_count=12,
+        laser_mm=np.array([0.0, position, 100.0]),
+        plane_normal=np.array([0.0, 1.0, 0.0]),
+        travel=np.array([0.0, 1.0, 0.0]),
+        position_mm=position,
+        line_spacing_mm=0.2,
+        step_mm=0.2,
+    )

@@ -1,0 +1,23 @@
+"""Whether scans can begin without waiting for a compiler: compiles everything once a process."""
+
+import threading
+
+from scanner_service.analysis.compiling import compile_kernels
+from scanner_service.rescan.requirement import Requirement
+from scanner_service.sessions.results import judge
+
+_LOCK = threading.Lock()
+_READY = threading.Event()
+
+
+def kernels_are_ready() -> bool:
+    """True once every kernel is compiled in this process."""
+    return _READY.is_set()
+
+
+def warm_up() -> None:
+    """Compile every kernel of map and regions, or load it from the cache; returns at once when that was done."""
+    with _LOCK:
+        if not _READY.is_set():
+            judge(compile_kernels(), Requirement())
+            _READY.set()
