@@ -14,10 +14,10 @@ from benchmarks.agreement import Agreement
 from benchmarks.cloud import NOISE_MM, RADIUS_MM, make_lines, uncertainty_mm
 from benchmarks.machine import Neighbours, fetch_memory, resident_bytes, use_cores
 from benchmarks.reader import Reader
+from scanner_service.analysis.compiling import compile_kernels
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.live_map import LiveMap, MapSettings
 from scanner_service.analysis.radius import RadiusSettings
-from scanner_service.analysis.compiling import compile_kernels
 
 READS_PER_S = 30.0
 DEFAULT_CEILING = MapSettings().max_points
