@@ -1,5 +1,6 @@
 """The sessions of one service: creates, holds open, reopens and deletes them; knows no HTTP and no scanline."""
 
+import contextlib
 import threading
 from collections.abc import Callable, Sequence
 
@@ -99,10 +100,10 @@ class SessionBook:
 
     def close(self) -> None:
         """Stop and close all sessions; the record stays open."""
-        with self._lock:
+        with self._lock, contextlib.ExitStack() as stack:  # one that cannot be closed keeps none of the others open
             for live in self._live.values():
-                live.close()
-            self._live.clear()
+                stack.callback(live.close)
+            self._live = {}
 
     def _hold(self, session: LiveSession, on_progress: Callable[[int], None] = lambda lines: None) -> LiveSession:
         session.open(on_progress)

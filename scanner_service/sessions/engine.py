@@ -62,7 +62,7 @@ class Engine:
         self._seen: set[tuple[str, int, int]] = set()
         self._open: dict[str, PassKey] = {}
         self._inbox: queue.Queue[_Line | _Ask | None] = queue.Queue(INBOX_LINES)
-        self._has_ended = False  # set before the inbox is emptied for the last time: see `_hand_over`
+        self._ended = threading.Event()  # set before the inbox is emptied for the last time: see `_hand_over`
         self._thread = threading.Thread(target=self._run, name=f"engine-{session_id}", daemon=True)
         self.busy_s = 0.0
 
@@ -95,12 +95,12 @@ class Engine:
 
     def _hand_over(self, message: "_Line | _Ask | None") -> bool:
         """Put a message into the inbox, waiting while it is full; False when the engine has ended."""
-        while self._thread.is_alive() and not self._has_ended:
+        while self._thread.is_alive() and not self._ended.is_set():
             try:
                 self._inbox.put(message, timeout=0.5)
             except queue.Full:
                 continue
-            if self._has_ended:  # perhaps too late for the engine to see it: nobody may be left waiting
+            if self._ended.is_set():  # perhaps too late for the engine to see it: nobody may be left waiting
                 self._refuse_the_rest()
             return True
         return False
@@ -142,7 +142,7 @@ class Engine:
                 self.failure = f"the session stopped by an internal fault: {error}"
                 break
             self.busy_s += self._clock() - begun
-        self._has_ended = True
+        self._ended.set()
         self._refuse_the_rest()
         self.live_map.close()
 

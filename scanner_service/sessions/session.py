@@ -162,11 +162,13 @@ class LiveSession:
 
     def close(self) -> None:
         """Let go of everything; a session that is scanning is stopped first."""
-        self.stop()
-        self._closing.set()
-        if self._analyst.is_alive():
-            self._analyst.join()
-        self.engine.close()
+        try:
+            self.stop()
+        finally:
+            self._closing.set()
+            if self._analyst.is_alive():
+                self._analyst.join()
+            self.engine.close()
 
     # -- what a source says (Sink) ------------------------------------------------------------------------------
 
@@ -280,10 +282,13 @@ class LiveSession:
         seen = -1
         while not self._closing.wait(period_s):
             begun_s = self._clock()
-            if self._state in ("scanning", "paused") or self._results is None:
-                before = seen
-                results = self._judge(unless=before)
-                seen = results.snapshot.version if results is not None else seen
+            try:
+                if self._state in ("scanning", "paused") or self._results is None:
+                    results = self._judge(unless=seen)
+                    seen = results.snapshot.version if results is not None else seen
+            except Exception as error:  # noqa: BLE001 - the thread's loop: the scan goes on, and its user is told
+                _LOG.exception("session %s could not be judged", self.row.session_id)
+                self._message = f"the scan could not be judged by an internal fault: {error}"
             period_s = max(ANALYSIS_PERIOD_S, 2.0 * (self._clock() - begun_s))
 
     def _judge(self, unless: int | None = None) -> Results | None:

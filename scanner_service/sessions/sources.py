@@ -4,6 +4,7 @@ A source runs its own thread and hands frozen scanlines to a `Sink`; it knows no
 """
 
 import contextlib
+import logging
 import math
 import threading
 import time
@@ -29,6 +30,8 @@ from drivers.scanners.native import Happening, NativeScanner
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.storage.errors import RecordError
+
+_LOG = logging.getLogger(__name__)
 
 
 class Sink(Protocol):
@@ -102,12 +105,14 @@ class DeviceSource:
 
     def stop(self) -> None:
         """Stop the pass, switch the laser off and close the port."""
+        was_stopping = self._stopping.is_set()
         self._stopping.set()
         if self._thread is None:  # never started: nobody else lets go of the port
             self._scanner.exit()
             return
-        with contextlib.suppress(DriverError):  # the device may be gone: then there is nothing left to stop
-            self._scanner.stop_pass()
+        if not was_stopping:
+            with contextlib.suppress(DriverError):  # the device may be gone: then there is nothing left to stop
+                self._scanner.stop_pass()
         if self._thread is not threading.current_thread():
             self._thread.join()
 
@@ -134,6 +139,9 @@ class DeviceSource:
                     is_over = self._pass_on(event, sink) or is_over
         except DriverError as error:
             failure = str(error)
+        except Exception as error:  # noqa: BLE001 - the thread's loop: the laser goes off and the session is told
+            _LOG.exception("reading the scanner stopped")
+            failure = f"reading the scanner stopped by an internal fault: {error}"
         self._scanner.exit()
         sink.ended(failure)
 
@@ -228,6 +236,9 @@ class ReplaySource:
                 self._line_count = self._played  # a record may hold lines of withdrawn passes, which are not played
         except RecordError as error:
             failure = str(error)
+        except Exception as error:  # noqa: BLE001 - the thread's loop: the session is told, or it would never end
+            _LOG.exception("the replay stopped")
+            failure = f"the replay stopped by an internal fault: {error}"
         sink.ended(failure)
 
 

@@ -147,7 +147,10 @@ def delete_session(request: Request, session_id: str) -> Response:
 
 @router.get("/{session_id}/events", dependencies=[viewer])
 def list_events(
-    request: Request, session_id: str, after: Annotated[int, Query(ge=-1, lt=2**63)] = -1, limit: Annotated[int, Query(ge=1, le=1000)] = 100
+    request: Request,
+    session_id: str,
+    after: Annotated[int, Query(ge=-1, lt=2**63)] = -1,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> Response:
     """What happened in the session, in order."""
     found = []
