@@ -37,7 +37,9 @@ def replay_command(
         bool, typer.Option("--plain-radius", help="Ignore the point spacing (plain Eq. 6.3).")
     ] = False,
     density: Annotated[float | None, typer.Option(help="Required points per mm²; half the nominal by default.")] = None,
-    noise: Annotated[float, typer.Option(min=0, help="The scanner's noise in mm, one standard deviation.")] = 0.0,
+    noise: Annotated[
+        float | None, typer.Option(min=0, help="The scanner's noise in mm, one standard deviation; 0 by default.")
+    ] = None,
     speed: Annotated[float | None, typer.Option(help="Times real time; as fast as possible by default.")] = None,
     session: Annotated[str | None, typer.Option(help="Which session of a record; the newest by default.")] = None,
     record: Annotated[Path | None, typer.Option(help="Keep the replayed session in this record file.")] = None,
@@ -48,6 +50,10 @@ def replay_command(
         with Record.open(record or Path(folder) / "record.sqlite") as opened, contextlib.ExitStack() as stack:
             spec: RecordSpec | ReplaySpec
             if is_record(file):
+                _refuse_what_a_record_knows(
+                    units=units, line_spacing=line_spacing, laser=laser, density=density, noise=noise,
+                    plain_radius=plain_radius or None,
+                )  # fmt: skip
                 reader = RecordReader.open(file)
                 stack.callback(reader.close)
                 spec = RecordSpec.find(reader, session, speed)
@@ -65,7 +71,7 @@ def replay_command(
                 settings = SessionSettings(
                     point_spacing_mm=0.0 if plain_radius else _known(recording.point_spacing_mm),
                     density_per_mm2=density,
-                    noise_mm=noise,
+                    noise_mm=noise or 0.0,
                 )
             book = SessionBook(opened)
             stack.callback(book.close)
@@ -106,6 +112,13 @@ def _tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
         highlight=False,
     )
     console.print(f"Written to {out}: {', '.join(OUTPUT_FILES)}", highlight=False, soft_wrap=True)
+
+
+def _refuse_what_a_record_knows(**options: object) -> None:
+    """A record is played with the settings it was taken with: an option that would be without effect is an error."""
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
+    if given:
+        raise ValueError(f"a record is replayed with its own settings: leave out {', '.join(given)}")
 
 
 def is_record(file: Path) -> bool:
