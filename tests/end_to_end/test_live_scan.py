@@ -242,6 +242,35 @@ def test_a_port_in_use_is_refused_by_name(running):
     assert simulator.port in answer.json()["detail"]
 
 
+def test_a_session_that_was_never_started_lets_go_of_its_port(running):
+    service, simulator = running.service(), running.simulator("plate")
+    session_id = service.create(**device(simulator))
+    service.client.post(f"/api/v1/sessions/{session_id}/stop")
+    again = service.create(**device(simulator))
+    service.client.delete(f"/api/v1/sessions/{again}")
+    service.create(**device(simulator))
+
+
+@pytest.mark.parametrize("request_", [b"{}", "[" * 1024, '{"credit": 0}'])
+def test_a_request_that_is_not_understood_ends_the_stream_and_says_so(running, request_):
+    service = running.service()
+    session_id = service.create(kind="push")
+    with live_client(service, session_id) as client:
+        client.socket.send(request_)
+        with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
+            while True:
+                told = client.socket.recv(timeout=10)
+    assert closed.value.rcvd.code == 1008
+    assert json.loads(told)["type"] == "error"
+
+
+def test_numbers_beyond_the_record_are_refused_and_no_fault(running):
+    service = running.service()
+    session_id = service.create(kind="push")
+    answer = service.client.get(f"/api/v1/sessions/{session_id}/events", params={"after": 10**20})
+    assert answer.status_code == 422
+
+
 def test_pushed_scanlines_are_answered_when_durable_and_stored_once(running):
     service = running.service()
     session_id = service.create(kind="push")

@@ -1,0 +1,96 @@
+"""The engine's inbox: whoever hands something over gets an answer, also from an engine that ends meanwhile."""
+
+import threading
+from concurrent.futures import Future, wait
+
+import numpy as np
+import pytest
+
+from scanner_service.analysis.live_map import MapSettings
+from scanner_service.sessions.engine import Engine
+from scanner_service.sessions.errors import SessionNotLive
+from scanner_service.storage.record import Record
+from tests.unit.analysis.scans import surface_scan
+
+LINES = surface_scan(lambda x, y: 0.0 * x, lines=4)
+
+
+@pytest.fixture
+def engine(tmp_path):
+    with Record.open(tmp_path / "record.sqlite") as record:
+        row = record.create_session("test")
+        engine = Engine(row.session_id, record, MapSettings(max_points=1000), np.zeros(3))
+        yield engine
+        engine.close()
+
+
+def balances(ledger):
+    decided = ledger.stored + ledger.duplicates + ledger.conflicts + sum(ledger.refused.values())
+    return ledger.received == ledger.pending + decided
+
+
+def break_down(engine):
+    """Let the next line be one too many for the map, in a way that nobody foresaw."""
+
+    def fault(line):
+        raise ZeroDivisionError("a fault of the program")
+
+    engine.live_map.add = fault
+
+
+def test_after_a_fault_lines_and_questions_are_refused_and_counted(engine):
+    break_down(engine)
+    engine.start()
+    engine.put(LINES[0])
+    with pytest.raises(SessionNotLive, match="internal fault"):
+        engine.ask(lambda engine: engine.live_map.version).result(10)
+    with pytest.raises(SessionNotLive, match="internal fault"):
+        engine.put(LINES[1])
+    assert engine.ledger.received == 2
+    assert engine.ledger.refused["too_late"] == 1
+    assert balances(engine.ledger)
+
+
+def test_everybody_is_answered_when_the_engine_closes_in_the_middle(engine):
+    engine.start()
+    answers = []
+    barrier = threading.Barrier(9)
+
+    def ask_much():
+        barrier.wait(10)
+        answers.extend([engine.ask(lambda engine: engine.live_map.version) for _ in range(500)])
+
+    threads = [threading.Thread(target=ask_much) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    barrier.wait(10)
+    engine.close()
+    for thread in threads:
+        thread.join(30)
+    assert len(answers) == 4000
+    assert not wait(answers, timeout=10).not_done
+
+
+def test_an_asker_that_has_left_disturbs_nobody_at_closing(engine):
+    held = threading.Event()
+    engine.start()
+    first = engine.ask(lambda engine: held.wait(10))
+    closing = threading.Thread(target=engine.close)
+    closing.start()
+    while engine._inbox.qsize() == 0:  # until the end is in the inbox: what comes now is too late
+        pass
+    left, stayed = engine.ask(lambda engine: 1), engine.ask(lambda engine: 2)
+    left.cancel()
+    held.set()
+    closing.join(10)
+    assert first.result(10)
+    with pytest.raises(SessionNotLive):
+        stayed.result(10)
+
+
+def test_a_pushed_line_in_the_inbox_cannot_be_called_back(engine):
+    reply = Future()
+    engine.start()
+    engine.put(LINES[0], reply)
+    assert not reply.cancel()
+    assert reply.result(10).outcome == "stored"

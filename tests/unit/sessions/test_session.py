@@ -1,0 +1,138 @@
+"""A session's ends: by its user, by its source, by a fault; and what is let go of then."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from drivers.rig import Rig
+from drivers.scanline import DeviceInfo, SensorGeometry
+from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.errors import SessionBusy, SourceUnusable
+from scanner_service.sessions.settings import SessionSettings
+from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec
+from scanner_service.sessions.sources import DeviceSource, PassRequest, ReplaySource
+from scanner_service.storage.reader import RecordReader
+from scanner_service.storage.record import Record
+from tests.unit.analysis.scans import scanline, surface_scan
+
+SETTINGS = SessionSettings(max_points=20_000)
+LINES = surface_scan(lambda x, y: 0.0 * x, lines=12)
+
+
+@pytest.fixture
+def book(tmp_path):
+    with Record.open(tmp_path / "record.sqlite") as record:
+        book = SessionBook(record)
+        yield book
+        book.close()
+
+
+def replay(book, lines):
+    session = book.create("test", PushSpec(), SETTINGS, source=ReplaySource(lines, len(LINES)))
+    session.start()
+    assert session.wait_until_over(30)
+    return session
+
+
+def test_a_replay_is_judged_before_it_is_over(book):
+    session = replay(book, LINES)
+    assert session.state == "stopped"
+    assert session.results().snapshot.settled.all()
+    assert session.results().snapshot.lines.line_index.tolist() == list(range(12))
+
+
+def test_a_source_that_breaks_down_fails_its_session_with_what_was_scanned(book):
+    def lines():
+        yield from LINES[:5]
+        raise ZeroDivisionError("a fault of the program")
+
+    session = replay(book, lines())
+    assert session.state == "failed"
+    assert "internal fault" in session.status().message
+    assert len(session.results().snapshot.lines) == 5
+
+
+def test_an_engine_that_breaks_down_fails_its_session_and_closes_like_any_other(book):
+    def fault(line):
+        raise ZeroDivisionError("a fault of the program")
+
+    session = book.create("test", PushSpec(), SETTINGS)
+    session.engine.live_map.add = fault
+    other = book.create("other", PushSpec(), SETTINGS)
+    session.start()
+    session.push(scanline([[0, 0, 0]])).result(10)
+    session.stop()
+    assert (session.state, book.record.get_session(session.row.session_id).state) == ("failed", "failed")
+    assert "internal fault" in session.status().message
+    book.delete(session.row.session_id)
+    assert book.open_sessions() == [other]
+
+
+def test_a_source_is_stopped_when_the_engine_has_broken_down(book):
+    def endless():
+        while True:
+            yield LINES[0]
+
+    session = book.create("test", PushSpec(), SETTINGS, source=ReplaySource(endless(), 1))
+    session.engine.live_map.can_take = None
+    session.start()
+    assert session.wait_until_over(30)
+    assert session.state == "failed"
+
+
+def test_a_line_pushed_after_the_stop_is_refused(book):
+    session = book.create("test", PushSpec(), SETTINGS)
+    with pytest.raises(SessionBusy, match="start it"):
+        session.push(scanline([[0, 0, 0]]))
+    session.start()
+    session.push(scanline([[0, 0, 0]])).result(10)
+    session.stop()
+    with pytest.raises(SessionBusy, match="stopped"):
+        session.push(scanline([[0, 0, 0]], 1))
+
+
+def test_an_open_session_is_found_while_another_is_being_reopened(book):
+    session = book.create("test", PushSpec(), SETTINGS)
+    found = []
+    with book._lock:
+        asking = threading.Thread(target=lambda: found.append(book.get(session.row.session_id)))
+        asking.start()
+        asking.join(10)
+    assert found == [session]
+
+
+class SilentScanner:
+    """Stands in for a scanner that was greeted, and counts what it is told."""
+
+    def __init__(self):
+        self.told = []
+
+    def stop_pass(self):
+        self.told.append("stop_pass")
+
+    def exit(self):
+        self.told.append("exit")
+
+
+def test_a_device_that_was_never_started_is_let_go_of():
+    scanner = SilentScanner()
+    geometry = SensorGeometry(np.array([0.0, 0.0, 90.0]), np.zeros(3), (-9.0, 9.0), 0.01)
+    info = DeviceInfo("SN-1", "M", "F", "C", 77, 100, geometry)
+    DeviceSource(scanner, Rig(), PassRequest(0.2, 0.0, 1.0, 50.0), info).stop()
+    assert scanner.told == ["exit"]
+
+
+@pytest.mark.parametrize("port", ["\0", "/dev/tty\0USB", "/etc/passwd", "/dev/../etc/passwd"])
+def test_a_port_that_cannot_be_one_is_refused(port):
+    with pytest.raises(SourceUnusable):
+        DeviceSpec(port, 9600, 0.2, 0.0, 1.0, 50.0).open()
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_record_is_replayed_at_a_pace_or_not_at_all(book, speed, tmp_path):
+    session = replay(book, LINES)
+    reader = RecordReader.open(tmp_path / "record.sqlite")
+    with pytest.raises(SourceUnusable, match="greater than 0"):
+        RecordSpec.find(reader, session.row.session_id, speed).open()
+    reader.close()
