@@ -13,7 +13,6 @@ from scanner_service.analysis.radius import (
     FLEXIBLE_POINTS,
     GLOBAL_SHARE,
     flexible_radius_mm,
-    global_radius_mm,
     sample_rows,
 )
 from scanner_service.analysis.snapshot import MapSnapshot, RadiusRule
@@ -73,12 +72,15 @@ def analyse_cloud(
     elif rule == "flexible":
         radius = flexible_radius_mm(stored_mm * QUANTUM_MM, rows, uncertainty_mm, limit_mm)
         notes.append(f"radius grown until {FLEXIBLE_POINTS} points are covered, at most {limit_mm:g} mm")
+        notes += _at_the_limit(radius, limit_mm, "points")
     else:
         sample = sample_rows("cloud", 0, np.zeros(len(rows), dtype=np.int64), line.index.astype(np.int64))
         if not len(sample):
             sample = rows
             notes.append("the cloud is too small for a 1 % sample, so every point is in it")
-        one = global_radius_mm(stored_mm * QUANTUM_MM, sample, uncertainty_mm, limit_mm)
+        grown = flexible_radius_mm(stored_mm * QUANTUM_MM, sample, uncertainty_mm, limit_mm)
+        notes += _at_the_limit(grown, limit_mm, "sampled points")
+        one = float(np.median(grown))
         radius = np.full(len(rows), one)
         notes.append(f"global radius {one:.4f} mm: median of {len(sample)} points (1 in {GLOBAL_SHARE})")
     settings = MapSettings(
@@ -94,7 +96,22 @@ def analyse_cloud(
     live_map.close_all_passes()
     snapshot = live_map.snapshot()
     live_map.close()
+    if accepted.counted < 0.5 * len(points_mm):
+        notes.append(
+            f"only {accepted.counted} of {len(points_mm)} points count, the others crowd into cells of "
+            f"{accepted.radius_mm:g} mm: is the unit of the file right, and the radius?"
+        )
     return CloudAnswer(snapshot, {**line.dropped, **accepted.left_out}, tuple(notes))
+
+
+def _at_the_limit(radius_mm: Float64Array, limit_mm: float, what: str) -> list[str]:
+    """Say when a limit, and not the rule, gave radii."""
+    count = int((radius_mm >= limit_mm).sum())
+    if not count:
+        return []
+    return [
+        f"{count} of {len(radius_mm)} {what} reach the limit of {limit_mm:g} mm before 20 points: allow a larger one"
+    ]
 
 
 def _as_line(points_mm: Float64Array, seen_from_mm: Float64Array) -> Scanline:

@@ -139,12 +139,3 @@ def sample_rows(
         state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         state ^= state >> np.uint64(31)
     return np.flatnonzero(state % np.uint64(GLOBAL_SHARE) == 0)
-
-
-def global_radius_mm(
-    points_mm: Float64Array, rows: npt.NDArray[np.int64], uncertainty_mm: float, max_radius_mm: float
-) -> float:
-    """Median of the flexible radii of the sampled rows: one radius for a whole cloud. NaN when the sample is empty."""
-    if not len(rows):
-        return math.nan
-    return float(np.median(flexible_radius_mm(points_mm, rows, uncertainty_mm, max_radius_mm)))

@@ -8,15 +8,17 @@ import typer
 
 from scanner_service import __version__
 from scanner_service.analysis.cloud import CloudRule, analyse_cloud
+from scanner_service.analysis.snapshot import Unreliable
 from scanner_service.commands.options import parse_position, parse_units
-from scanner_service.commands.terminal import console, errors, plain_errors, show_json
-from scanner_service.rescan.requirement import Requirement
-from scanner_service.sessions.results import judge, summarise
+from scanner_service.commands.terminal import check_folder, console, errors, plain_errors, show_json
+from scanner_service.sessions.results import summarise_cloud
 from scanner_service.storage.exports.density_png import density_png
 from scanner_service.storage.exports.points_ply import write_points_ply
 from scanner_service.storage.exports.results_json import write_json
 from scanner_service.storage.exports.whole_file import write_whole
 from scanner_service.storage.formats import ReadOptions, open_cloud
+
+NO_REGIONS = "a plain cloud has no scanlines, so it cannot be told where the scanner missed something, or why"
 
 
 def analyse_command(
@@ -33,6 +35,7 @@ def analyse_command(
     """Analyse a cloud with a given radius or one of the chapter's rules, and write the result files."""
     with plain_errors():
         chosen = _rule(rule, radius)
+        check_folder(out)
         cloud = open_cloud(file, ReadOptions(parse_units(units)))
         position = parse_position(seen_from)
         with errors.status("computing density and normals …"):
@@ -46,26 +49,24 @@ def analyse_command(
         notes = (*cloud.notes, *found.notes)
         for note in notes:
             errors.print(f"note: {note}", highlight=False, soft_wrap=True)
-        results = judge(found.snapshot, Requirement(density_per_mm2=density), None)
+        snapshot = found.snapshot
         losses = {"points": {"declared": cloud.points_declared, "dropped": dict(cloud.dropped) | found.dropped}}
-        summary = {"name": file.name} | summarise(results, losses, float("nan"), __version__, notes)
-        out.mkdir(parents=True, exist_ok=True)
-        write_points_ply(out / "points.ply", results.snapshot, results.verdict.rescan, version=__version__)
-        write_whole(
-            out / "density.png",
-            density_png(
-                results.snapshot, results.report.regions, session_name=file.name, coverage=results.coverage.share
-            ),
-        )
-        write_json(out / "regions.json", results.report.to_dict())
+        summary = {"name": file.name} | summarise_cloud(snapshot, losses, __version__, notes)
+        rescan = np.zeros(len(snapshot), dtype=np.bool_)
+        if density is not None:
+            rescan = (snapshot.density_per_mm2 < density) & (snapshot.unreliable != Unreliable.NOT_COUNTED)
+            summary["below_required"] = int(rescan.sum())
+        write_points_ply(out / "points.ply", snapshot, rescan, version=__version__)
+        write_whole(out / "density.png", density_png(snapshot, session_name=file.name))
+        write_json(out / "regions.json", {"regions": [], "notes": [NO_REGIONS]})
         write_json(out / "summary.json", summary)
         if as_json:
             show_json(summary)
             return
-        median = summary["density_per_mm2"]["median"]
         console.print(
-            f"{len(results.snapshot):,} points, radius {summary['radius_mm']['median']:.3f} mm, density "
-            f"{median:.2f} points/mm², {summary['reliable_share']:.1%} with a reliable normal",
+            f"{len(snapshot):,} points, radius {summary['radius_mm']['median']:.3f} mm, density "
+            f"{summary['density_per_mm2']['median']:.2f} points/mm², {summary['reliable_share']:.1%} with a reliable "
+            "normal" + (f"; {summary['below_required']:,} below {density:g} points/mm²" if density is not None else ""),
             highlight=False,
         )
         console.print(f"Written to {out}: points.ply, density.png, regions.json, summary.json", highlight=False)
@@ -75,6 +76,8 @@ def _rule(rule: str | None, radius: float | None) -> CloudRule:
     """The rule asked for; a radius alone means `fixed`, nothing means `global`."""
     if rule is None:
         return "fixed" if radius is not None else "global"
+    if rule == "fixed" and radius is None:
+        raise ValueError("the rule `fixed` needs a radius: say --radius R in mm")
     if rule != "fixed" and radius is not None:
         raise ValueError(f"a radius is given and the rule is {rule}: leave one of them out")
     for known in get_args(CloudRule):

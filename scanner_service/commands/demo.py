@@ -20,6 +20,7 @@ from scanner_service.api.login import login_url
 from scanner_service.api.server import ServerThread
 from scanner_service.api.service import Service
 from scanner_service.commands.terminal import (
+    check_folder,
     console,
     errors,
     fail,
@@ -30,6 +31,7 @@ from scanner_service.commands.terminal import (
 )
 from scanner_service.sessions.outputs import OUTPUT_FILES
 
+DEMO_PARTS = ("demo", "plate", "step", "sphere")
 LINE_SPACING_MM = 0.15
 LINE_RATE_HZ = 50.0
 BAUD_RATE = 3_000_000
@@ -48,12 +50,15 @@ def demo_command(
 ) -> None:
     """Scan a simulated part over a pseudo-terminal, live, and write what was found."""
     with plain_errors(), tempfile.TemporaryDirectory(prefix="scanner-demo-") as folder, contextlib.ExitStack() as stack:
-        out.mkdir(parents=True, exist_ok=True)
+        check_folder(out)
+        if part not in DEMO_PARTS:
+            fail(f"there is no part {part}; the parts are {', '.join(DEMO_PARTS)}")
         service = Service.open(Path(folder))
         stack.callback(service.close)
         listening = stack.enter_context(ServerThread(make_app(service), port=port))
         viewer = login_url(service.access, listening.url)
-        errors.print(f"Viewer: {viewer}  (works once; {'stays up until Ctrl-C' if keep else 'while the scan runs'})")
+        errors.print(f"Viewer: {viewer}", soft_wrap=True, highlight=False)
+        errors.print(f"        (the address works once; {'it serves until Ctrl-C' if keep else 'gone after the scan'})")
         if browse:
             webbrowser.open(viewer)
         wait_until_ready(listening.url)

@@ -10,6 +10,7 @@ import typer
 
 from scanner_service.commands.options import parse_position, parse_units
 from scanner_service.commands.terminal import (
+    check_folder,
     console,
     errors,
     plain_errors,
@@ -73,6 +74,7 @@ def replay_command(
                     density_per_mm2=density,
                     noise_mm=noise or 0.0,
                 )
+            check_folder(out)
             book = SessionBook(opened)
             stack.callback(book.close)
             live = book.create(file.name, spec, settings, origin_mm, source)

@@ -4,7 +4,9 @@ import contextlib
 import json
 import math
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
@@ -50,8 +52,18 @@ def plain_errors() -> Iterator[None]:
     except EXPECTED as error:
         fail(str(error) or type(error).__name__)
     except KeyboardInterrupt:
-        errors.print("Stopped.")
+        errors.print("Stopped; what was not yet written is gone.")
         raise typer.Exit(130) from None
+
+
+def check_folder(folder: Path) -> None:
+    """Make the folder for results if need be, and make sure before any work that files can be written there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        fail(f"no file can be written to {folder} ({error.strerror}): choose another folder with --out")
 
 
 def show_json(value: Any) -> None:

@@ -56,15 +56,42 @@ def summarise(
 ) -> dict[str, Any]:
     """The content of summary.json: lengths in millimetres, densities in points/mm2, NaN for what is not known."""
     snapshot, report, coverage = results.snapshot, results.report, results.coverage
+    return _of_points(snapshot, losses, version, notes) | {
+        "scanlines": len(snapshot.lines),
+        "line_spacing_mm": _spread(snapshot.lines.line_spacing_mm),
+        "point_spacing_mm": _spread(snapshot.lines.point_spacing_mm),
+        "coverage": {
+            "kind": "observed",
+            "share": coverage.share,
+            "cell_mm": coverage.cell_mm,
+            "gap_mm2": coverage.gap_mm2,
+        },
+        "regions": {
+            "count": len(report.regions),
+            "area_mm2": float(sum(region.area_mm2 for region in report.regions)),
+            "by_reason": _areas(report),
+        },
+        "points_per_s": points_per_s,
+    }
+
+
+def summarise_cloud(
+    snapshot: MapSnapshot, losses: Mapping[str, Any], version: str, notes: tuple[str, ...]
+) -> dict[str, Any]:
+    """The content of summary.json for a plain cloud: nothing that needs scanlines."""
+    return _of_points(snapshot, losses, version, notes)
+
+
+def _of_points(
+    snapshot: MapSnapshot, losses: Mapping[str, Any], version: str, notes: tuple[str, ...]
+) -> dict[str, Any]:
+    """What is said of the points alone."""
     counted = snapshot.unreliable != Unreliable.NOT_COUNTED
     reliable = snapshot.reliable
     return {
         "version": version,
         "points": len(snapshot),
         "points_counted": int(counted.sum()),
-        "scanlines": len(snapshot.lines),
-        "line_spacing_mm": _spread(snapshot.lines.line_spacing_mm),
-        "point_spacing_mm": _spread(snapshot.lines.point_spacing_mm),
         "radius_mm": _spread(snapshot.radius_mm),
         "radius_rules": {
             rule.name.lower(): int(count)
@@ -80,19 +107,7 @@ def summarise(
         },
         "settled_share": float(snapshot.settled.mean()) if len(snapshot) else math.nan,
         "isolated": int(snapshot.isolated.sum()),
-        "coverage": {
-            "kind": "observed",
-            "share": coverage.share,
-            "cell_mm": coverage.cell_mm,
-            "gap_mm2": coverage.gap_mm2,
-        },
-        "regions": {
-            "count": len(report.regions),
-            "area_mm2": float(sum(region.area_mm2 for region in report.regions)),
-            "by_reason": _areas(report),
-        },
         "losses": dict(losses),
-        "points_per_s": points_per_s,
         "notes": list(notes),
     }
 

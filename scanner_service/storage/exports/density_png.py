@@ -127,9 +127,11 @@ def density_png(
 
 
 def _title(figure: Figure, session_name: str, when: str, coverage: float, snapshot: MapSnapshot) -> None:
-    facts = [f"{len(snapshot):,} points in {len(snapshot.lines):,} scanlines".replace(",", "\u202f")]
+    points = f"{len(snapshot):,} points".replace(",", "\u202f")
+    scanlines = f"{len(snapshot.lines):,} scanlines".replace(",", "\u202f")
+    facts = [points if len(snapshot.lines) == 1 else f"{points} in {scanlines}"]
     if np.isfinite(coverage):
-        facts.insert(0, f"observed coverage {np.floor(1000 * coverage) / 10:.1f} %")
+        facts.insert(0, f"observed coverage {100 * coverage:.1f} %")
     if when:
         facts.append(when)
     title = figure.suptitle(_drawable(session_name), fontsize=15, fontweight="bold", color=_INK, fontfamily=_FONT)
