@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.cloud import LINE_SPACING_MM, NOISE_MM, POINT_SPACING_MM, POINTS_PER_LINE, RADIUS_MM
-from benchmarks.machine import describe_machine, is_installed
+from benchmarks.machine import describe_machine, is_installed, wait_for_quiet
 from benchmarks.summary import print_summary, summarise
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -105,6 +105,7 @@ def run(chosen: argparse.Namespace) -> Figures:
             _say(f"start-up: cold {start['cold']['ready_s']:.1f} s, warm {start['warm']['ready_s']:.2f} s")
         for number in range(chosen.repeats):
             for case in cases(chosen):
+                wait_for_quiet(chosen.patience_s)
                 more: list[str] = []
                 if case.module == "live_run" and number == 0:
                     more = ["--checks", str(chosen.checks)]
@@ -147,6 +148,9 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=3, help="rounds; medians are reported")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="numbers of threads, a core each")
     parser.add_argument("--checks", type=int, default=20, help="random lines at which the oracle is asked, round one")
+    parser.add_argument(
+        "--patience-s", type=float, default=10.0, help="how long to wait for a quiet machine, each time"
+    )
     parser.add_argument("--without-peers", action="store_true", help="leave Open3D and scipy out")
     parser.add_argument("--one-radius", action="store_true", help="leave 2r and 4r out")
     parser.add_argument(

@@ -93,6 +93,16 @@ class Neighbours:
         return max(0.0, others / max(elapsed, 1e-9))
 
 
+def wait_for_quiet(patience_s: float) -> None:
+    """Return as soon as others leave the machine alone for a moment, or when patience is at its end."""
+    until = time.monotonic() + patience_s
+    while time.monotonic() < until:
+        others = Neighbours.watch()
+        time.sleep(0.3)
+        if others.cores_taken() < 0.1:
+            return
+
+
 def _machine_busy_s() -> float:
     """Processor time of all processes, interrupts and stolen time, since the machine was started."""
     user, nice, system, _idle, _wait, irq, soft_irq, steal = (

@@ -5,6 +5,9 @@ from typing import Any
 
 Figures = dict[str, Any]
 
+QUIET_CORES = 0.25
+"""Others may take so much of the machine before a round counts as disturbed."""
+
 
 def summarise(rounds: dict[tuple[str, int], list[Figures]]) -> dict[str, Figures]:
     """For each number of threads the headline figures, and below them the median of each case.
@@ -40,12 +43,18 @@ def summarise(rounds: dict[tuple[str, int], list[Figures]]) -> dict[str, Figures
 
 
 def _median(runs: list[Figures]) -> Figures:
-    """The median of every number, round by round; what is no number is that of the first round."""
+    """The median of every number over the quiet rounds; what is no number is that of the first round.
+
+    A round is quiet when others took less than QUIET_CORES; where none was, all count, and `quiet_rounds` is 0.
+    """
+    quiet = [run for run in runs if run["cores_taken_by_others"] < QUIET_CORES]
     middle = dict(runs[0])
     for name, value in runs[0].items():
         if isinstance(value, float):
-            middle[name] = statistics.median(run[name] for run in runs)
+            middle[name] = statistics.median(run[name] for run in quiet or runs)
+    middle["quiet_rounds"] = len(quiet)
     middle["points_per_s_of_rounds"] = [run["points_per_s"] for run in runs]
+    middle["cores_taken_by_others_of_rounds"] = [run["cores_taken_by_others"] for run in runs]
     return middle
 
 
@@ -79,6 +88,10 @@ def print_summary(result: Figures) -> None:
     start = result["start_up"]
     if start is not None:
         print(f"start-up: cold {start['cold']['ready_s']:.1f} s, warm {start['warm']['ready_s']:.2f} s")
+    cases = [figures for count in columns for figures in result["threads"][count]["cases"].values()]
+    disturbed = sum(figures["quiet_rounds"] == 0 for figures in cases)
+    if disturbed:
+        print(f"{disturbed} of {len(cases)} figures come from rounds in which others took {QUIET_CORES} cores or more")
     load = machine["load_average"]
     print(f"{machine['processor']}, {machine['cores']} cores; load average {load[0]:.2f} before the run")
 
