@@ -1,5 +1,7 @@
 """The composition root of the command line: which commands there are; the bare command serves."""
 
+import os
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -44,7 +46,7 @@ def bare(
 ) -> None:
     """Without a command: serve with the defaults."""
     if context.invoked_subcommand is None:
-        serve_command(DEFAULT_DATA)
+        serve_command(Path(os.environ.get("SCANNER_DATA") or DEFAULT_DATA))
 
 
 def main() -> None:

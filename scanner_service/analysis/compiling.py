@@ -9,6 +9,8 @@ from scanner_service.analysis.live_map import LiveMap, MapSettings
 from scanner_service.analysis.radius import LiveRule, RadiusSettings
 from scanner_service.analysis.snapshot import MapSnapshot
 
+_PLACES = 600  # enough points for the first estimate of the global radius
+
 
 def compile_kernels() -> MapSnapshot:
     """Compile every kernel, or load it from the cache; returns a small map for whoever has kernels of their own."""
@@ -18,7 +20,7 @@ def compile_kernels() -> MapSnapshot:
         for number in range(4):
             live_map.add(_line(number))
             live_map.refresh()
-        live_map.add(_line(1, line_index=9, position_mm=0.21))
+        live_map.add(_line(1, line_index=9, position_mm=-0.5))  # a stage that turns back
         live_map.add(replace(_line(5), pass_index=1))
         live_map.withdraw_pass(("warm-up", 0, 1))
         live_map.snapshot()
@@ -28,8 +30,8 @@ def compile_kernels() -> MapSnapshot:
 
 def _line(number: int, line_index: int | None = None, position_mm: float | None = None) -> StoredLine:
     position = 0.2 * number if position_mm is None else position_mm
-    xyz_q = np.zeros((12, 3), dtype=np.int32)
-    xyz_q[:, 0] = np.arange(12) * 1000
+    xyz_q = np.zeros((_PLACES, 3), dtype=np.int32)
+    xyz_q[:, 0] = np.arange(_PLACES) * 1000
     xyz_q[:, 1] = round(position * 8192)
     return StoredLine(
         device_id="warm-up",
@@ -38,8 +40,8 @@ def _line(number: int, line_index: int | None = None, position_mm: float | None 
         line_index=number if line_index is None else line_index,
         device_time_s=0.0,
         xyz_q=xyz_q,
-        index=np.arange(12, dtype=np.int32),
-        point_count=12,
+        index=np.arange(_PLACES, dtype=np.int32),
+        point_count=_PLACES,
         laser_mm=np.array([0.0, position, 100.0]),
         plane_normal=np.array([0.0, 1.0, 0.0]),
         travel=np.array([0.0, 1.0, 0.0]),

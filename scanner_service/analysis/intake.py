@@ -12,6 +12,10 @@ import numpy.typing as npt
 from drivers.scanline import Float64Array, Scanline, read_only
 
 QUANTUM_MM = 2.0**-13
+LINE_SPACING_RANGE_MM = (1e-4, 1e3)
+"""Scanlines closer or farther apart than this are a mistake in the unit, not a scan."""
+
+LASER_RANGE_MM = 1e7
 _LIMIT_Q = 2**31 - 1
 
 
@@ -57,12 +61,18 @@ def quantise(line: Scanline, origin_mm: Float64Array) -> StoredLine:
 
     Raises
     ------
-    ValueError : when the line spacing is not a positive finite number, or the laser position is not finite.
+    ValueError : when the line spacing or the laser position is no number that a scan can have.
     """
     if not (np.isfinite(line.line_spacing_mm) and line.line_spacing_mm > 0):
         raise ValueError(f"line spacing must be greater than 0 mm, not {line.line_spacing_mm}")
-    if not np.isfinite(line.laser_mm).all():
-        raise ValueError(f"laser position must be three finite millimetres, not {line.laser_mm.tolist()}")
+    low_mm, high_mm = LINE_SPACING_RANGE_MM
+    if not low_mm <= line.line_spacing_mm <= high_mm:
+        raise ValueError(f"line spacing must lie between {low_mm:g} and {high_mm:g} mm, not {line.line_spacing_mm:g}")
+    if not (np.isfinite(line.laser_mm).all() and np.abs(line.laser_mm - origin_mm).max() <= LASER_RANGE_MM):
+        raise ValueError(
+            f"laser position must be three numbers within {LASER_RANGE_MM:g} mm of the origin, "
+            f"not {line.laser_mm.tolist()}"
+        )
     points = line.points_mm
     is_nan = np.isnan(points).all(axis=1)
     finite = np.isfinite(points).all(axis=1) & ~line.missing

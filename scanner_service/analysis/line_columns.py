@@ -39,6 +39,7 @@ class LineColumns:
         self._pass_bit: UInt8Array = np.zeros(256, dtype=np.uint8)
         self._used = 0
         self.laser_box_q = np.array([[np.inf] * 3, [-np.inf] * 3])
+        self._table: LineTable | None = None
         self._devices: dict[str, int] = {}
 
     def __len__(self) -> int:
@@ -105,13 +106,16 @@ class LineColumns:
         return self._laser_q[: self._used], self._pass_bit[: self._used]
 
     def table(self) -> LineTable:
-        """A copy of all rows."""
+        """A copy of all rows, made once for as many as there are."""
+        if self._table is not None and len(self._table) == self._used:
+            return self._table
         rows = self._rows[: self._used].copy()
 
         def column(name: str) -> Any:
             return np.ascontiguousarray(rows[name])
 
-        return LineTable(
+        self._table = LineTable(
             device_ids=tuple(self._devices),
             **{name: column(name) for name in _ROW.names or () if name != "first_row"},
         )
+        return self._table

@@ -217,6 +217,10 @@ class LiveMap:
         self._first_new = 0
         return count
 
+    def has_pass(self, key: PassKey) -> bool:
+        """True for a pass that is known and not withdrawn."""
+        return self._passes.is_in_force(key)
+
     def close_all_passes(self) -> None:
         """Close every pass that is open."""
         for key in self._passes.open_keys():
@@ -230,6 +234,11 @@ class LiveMap:
             raise MapFull(
                 f"the live map is configured for {self.settings.max_points} points and holds {self._used}: "
                 f"{more} more do not fit; raise max_points or start another session"
+            )
+        if self._grid_rows and int(self._grid.blocks_used[0]) + more > len(self._grid.block_key):
+            raise MapFull(
+                "the live map has no room for another line: the points are scattered too widely for "
+                f"{self.settings.max_points} max_points; raise it or start another session"
             )
 
     def _follow(self, of: Pass, line: StoredLine) -> None:
@@ -287,6 +296,7 @@ class LiveMap:
             return
         self._points["radius_mm"][: self._used] = radius_mm
         self._points["rule"][: self._used] = RadiusRule.GLOBAL
+        self._points["changed_at"][: self._used] = 0  # another radius is another answer, whatever it counts
         self._largest_radius_mm = radius_mm
         side_mm = max(radius_mm, self._rules.max_radius_mm / GROWTH_REACH)
         self._build_grid(max(math.ceil(side_mm / QUANTUM_MM), SMALLEST_SIDE_Q))
@@ -334,6 +344,11 @@ class LiveMap:
             while len(self._history) > 1 and self._history_rows > 2 * self._used:
                 self._history_rows -= len(self._history.popleft()[1])
         return rows
+
+    def read_version(self) -> int:
+        """The version after everything taken in was evaluated."""
+        self.refresh()
+        return self.version
 
     def changed_since(self, version: int) -> Int32Array | None:
         """The rows that changed after `version`, sorted; None when that is too long ago, and all must be read."""

@@ -133,6 +133,11 @@ class PassBook:
         known.is_withdrawn = True
         return known.number
 
+    def is_in_force(self, key: PassKey) -> bool:
+        """True for a pass that is known and not withdrawn."""
+        known = self._passes.get(key)
+        return known is not None and not known.is_withdrawn
+
     def open_keys(self) -> list[PassKey]:
         """The passes that are open, in the order they were opened."""
         return [key for key, value in self._passes.items() if value.slot >= 0]

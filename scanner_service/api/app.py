@@ -7,7 +7,7 @@ from starlette.types import ASGIApp
 
 from drivers.errors import DriverError, PortAbsent, PortBusy, PortNotPermitted
 from scanner_service import __version__, web
-from scanner_service.analysis.errors import MapFull
+from scanner_service.analysis.errors import MapFull, TooManyPasses
 from scanner_service.api.access import ACCESS_PROBLEMS
 from scanner_service.api.docs_page import install_docs
 from scanner_service.api.errors import ExportUnknown, ValueUnusable
@@ -36,6 +36,8 @@ SESSION_PROBLEMS: ProblemTable = {
     PortBusy: Problem(409, "port-busy", "Another program holds the port"),
     PortNotPermitted: Problem(403, "port-not-permitted", "The port may not be opened"),
     DriverError: Problem(502, "scanner-error", "The scanner does not do its part"),
+    TooManyPasses: Problem(409, "too-many-passes", "Too many passes are open"),
+    TimeoutError: Problem(503, "record-slow", "The disk does not answer"),
     MapFull: Problem(507, "map-full", "The live map is full"),
     RecordBusy: Problem(503, "record-busy", "The record cannot take more now"),
     RecordError: Problem(500, "record-error", "The record failed"),

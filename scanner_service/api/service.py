@@ -50,5 +50,7 @@ class Service:
 
     def close(self) -> None:
         """Stop the sessions, write what waits, let go of the record."""
-        self.book.close()
-        self.book.record.close()
+        try:
+            self.book.close()
+        finally:
+            self.book.record.close()

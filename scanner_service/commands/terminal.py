@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
+import httpx
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -26,6 +27,7 @@ from scanner_service.storage.formats.errors import FormatError
 console = Console(markup=False)  # what is told may hold brackets: paths, names, extras of a package
 errors = Console(stderr=True, markup=False)
 EXPECTED = (
+    httpx.HTTPError,
     DriverError,
     KeyStoreError,
     ServerError,

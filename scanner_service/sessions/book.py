@@ -1,6 +1,7 @@
 """The sessions of one service: creates, holds open, reopens and deletes them; knows no HTTP and no scanline."""
 
 import contextlib
+import logging
 import threading
 from collections.abc import Callable, Sequence
 
@@ -9,9 +10,11 @@ from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec, SourceSpec
 from scanner_service.sessions.sources import PushSource, Source, SpentSource
+from scanner_service.storage.errors import RecordError
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import SessionRow
 
+_LOG = logging.getLogger(__name__)
 MAX_LIVE = 16
 
 
@@ -24,7 +27,10 @@ class SessionBook:
         self._lock = threading.RLock()
         for row in self._all_rows():
             if row.state in ("scanning", "paused"):  # the service ended in the middle of it
-                record.set_state(row.session_id, "interrupted")
+                try:
+                    record.set_state(row.session_id, "interrupted")
+                except RecordError as error:  # one damaged row must not keep all others from being served
+                    _LOG.warning("session %s cannot be marked as interrupted: %s", row.session_id, error)
 
     def create(
         self,

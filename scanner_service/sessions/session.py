@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from drivers.scanline import Scanline
+from scanner_service.analysis.errors import AnalysisError
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.engine import Engine
@@ -92,12 +93,15 @@ class LiveSession:
         for number, line in self._record.lines(
             self.row.session_id, on_damage=lambda found: damaged.append(found.reason)
         ):
-            self.engine.restore(line)
+            try:
+                self.engine.restore(line)
+            except (AnalysisError, ValueError) as error:
+                damaged.append(f"line {number}: {error}")
             on_progress(number)
         for key in withdrawn_passes(self._record.events(self.row.session_id)):
             self.engine.withdraw_pass(key)
         if damaged:
-            self._message = f"{len(damaged)} stored lines are damaged and left out; the first: {damaged[0]}"
+            self._message = f"{len(damaged)} stored lines are left out; the first: {damaged[0]}"
         if self._state in ("stopped", "failed", "interrupted"):
             self.engine.close_passes()
         self.engine.start()
@@ -148,10 +152,13 @@ class LiveSession:
 
         Returns how many points that were; 0, and nothing recorded, when the pass is unknown or withdrawn already.
         """
+        named = {"device_id": key[0], "boot_id": key[1], "pass_index": key[2]}
+        if not self.engine.ask(lambda engine: engine.live_map.has_pass(key)).result():
+            return 0
+        # Durable first: a map that forgot what the record still counts would differ after the next start.
+        self._record.append_event(self.row.session_id, WITHDRAWN, named, timeout_s=5.0).result(30.0)
         count = self.engine.ask(lambda engine: engine.withdraw_pass(key)).result()
-        if count:
-            self._event(WITHDRAWN, {"device_id": key[0], "boot_id": key[1], "pass_index": key[2], "points": count})
-            self._judge()
+        self._judge()
         return count
 
     def stop(self) -> None:
@@ -294,9 +301,9 @@ class LiveSession:
     def _judge(self, unless: int | None = None) -> Results | None:
         """Take a snapshot, judge it, and put the verdict in force; None when the engine is gone."""
         try:
-            snapshot = self.engine.ask(lambda engine: engine.live_map.snapshot()).result()
-            if unless is not None and snapshot.version == unless:
+            if unless is not None and self.engine.ask(lambda engine: engine.live_map.read_version()).result() == unless:
                 return self._results
+            snapshot = self.engine.ask(lambda engine: engine.live_map.snapshot()).result()
             results = judge(snapshot, self.settings.requirement(), self.source.geometry, self.source.towards_sensor)
             self.engine.ask(
                 lambda engine: self.verdicts.replace(results.verdict, snapshot.version, engine.live_map)

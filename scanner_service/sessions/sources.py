@@ -167,7 +167,7 @@ class DeviceSource:
                 sink.note("rebooted", {"old_boot_id": old, "new_boot_id": new})
             case PassEnded(pass_index=pass_index, reason=reason):
                 sink.note("pass_ended", {"pass_index": pass_index, "reason": reason})
-                return reason in ("reached_end", "stopped")
+                return reason in ("reached_end", "stopped", "fault")
         return False
 
 

@@ -12,7 +12,7 @@ from scanner_service.analysis.intake import QUANTUM_MM, StoredLine
 from scanner_service.api.answers import answer
 from scanner_service.api.routes.sessions import Session, book_of, operator, viewer
 from scanner_service.api.schemas import ScanlinesIn
-from scanner_service.storage.rows import Stored
+from scanner_service.storage.rows import DamagedLine, Stored
 
 router = APIRouter(prefix="/api/v1/sessions/{session_id}/scanlines", tags=["scanlines"])
 
@@ -48,10 +48,13 @@ def read_scanlines(
     """Stored scanlines from number `start` on, exactly as they were quantised."""
     record = book_of(request).record
     row = record.get_session(session_id)
+    damaged: list[DamagedLine] = []
     found = [
-        _line_answer(number, line, row.origin_mm) for number, line in record.lines(session_id, start, start + limit)
+        _line_answer(number, line, row.origin_mm)
+        for number, line in record.lines(session_id, start, start + limit, on_damage=damaged.append)
     ]
-    return answer({"scanlines": found, "next": start + limit if len(found) == limit else None})
+    is_full = len(found) + len(damaged) == limit
+    return answer({"scanlines": found, "damaged": damaged, "next": start + limit if is_full else None})
 
 
 def _line_answer(number: int, line: StoredLine, origin_mm: tuple[float, float, float]) -> dict[str, object]:

@@ -42,7 +42,7 @@ def spec_of(source: DeviceSourceIn | ReplaySourceIn | PushSourceIn, replay_dir: 
         case DeviceSourceIn():
             return DeviceSpec(**source.model_dump(exclude={"kind"}))
         case ReplaySourceIn():
-            if not (replay_dir / source.file).is_file():
+            if source.file not in {item.name for item in replay_dir.iterdir()}:
                 raise SourceUnusable(f"there is no file {source.file} in the service's replay folder")
             options = ReadOptions(units=source.units, laser_mm=source.laser_mm, line_spacing_mm=source.line_spacing_mm)
             return ReplaySpec(replay_dir / source.file, options, source.speed)

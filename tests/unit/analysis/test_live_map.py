@@ -375,10 +375,27 @@ def test_more_open_passes_than_can_be_told_apart_are_refused():
     live.add(stored([[0, 0, 0]], 0, pass_index=7))
 
 
-@pytest.mark.parametrize("spacing", [0.0, -1.0, math.nan, math.inf])
-def test_a_line_spacing_that_is_not_positive_is_refused(spacing):
-    with pytest.raises(ValueError, match="greater than 0"):
+@pytest.mark.parametrize("spacing", [0.0, -1.0, math.nan, math.inf, 1e-320, 1e300])
+def test_a_line_spacing_that_no_scan_has_is_refused(spacing):
+    with pytest.raises(ValueError, match="line spacing must"):
         stored([[0, 0, 0]], line_spacing_mm=spacing)
+
+
+def test_a_laser_that_is_nowhere_near_is_refused():
+    with pytest.raises(ValueError, match="laser position"):
+        stored([[0, 0, 0]], laser_mm=np.array([0.0, 1e308, 0.0]))
+
+
+def test_points_scattered_too_widely_are_refused_before_anything_of_the_line_is_taken():
+    live = new_map(max_points=4000, radius=RadiusSettings(point_spacing_mm=0.0))
+    rng = np.random.default_rng(0)
+    taken = 0
+    with pytest.raises(MapFull, match="scattered too widely"):
+        for i in range(20):
+            live.add(stored(rng.uniform(-1e5, 1e5, (150, 3)), i, position_mm=float(i)))
+            taken += 150
+    assert len(live.snapshot()) == taken
+    assert live.line_count == taken // 150
 
 
 def test_quantising_accounts_for_every_place_of_the_line():
