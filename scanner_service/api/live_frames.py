@@ -6,21 +6,21 @@ import numpy as np
 import numpy.typing as npt
 
 from scanner_service.analysis.snapshot import Unreliable
-from scanner_service.sessions.updates import Update
+from scanner_service.sessions.updates import PointPage
 
 MAGIC = b"SLV1"
 KIND_POINTS = 1
 FLAG_FULL = 1
 HEADER = struct.Struct("<4sHHQQIIII")
 MAX_POINTS = 50_000
-"""Points in one message at the most, so that a slow client is never handed one huge one."""
+"""Points in one message at the most; a page is read when there is credit for it, so a slow client costs little."""
 
 
-def state_bits(update: Update) -> npt.NDArray[np.uint32]:
+def state_bits(page: PointPage) -> npt.NDArray[np.uint32]:
     """(m,) uint32: reliable, settled, isolated, rescan, not counted; then the two reasons."""
-    points, verdict = update.points, update.verdict
+    points, verdict = page.points, page.verdict
     not_counted = points.unreliable == Unreliable.NOT_COUNTED
-    bits = np.zeros(len(update.rows), dtype=np.uint32)
+    bits = np.zeros(len(page.rows), dtype=np.uint32)
     for shift, flag in enumerate((points.reliable, points.settled, points.isolated, verdict.rescan, not_counted)):
         bits |= flag.astype(np.uint32) << np.uint32(shift)
     bits |= points.unreliable.astype(np.uint32) << np.uint32(8)
@@ -28,33 +28,28 @@ def state_bits(update: Update) -> npt.NDArray[np.uint32]:
     return bits
 
 
-def point_messages(update: Update) -> list[bytes]:
-    """The update as one or more messages of at most MAX_POINTS points; only the first can say "forget what you have".
+def point_message(page: PointPage) -> bytes:
+    """A page of changed points as one message; only the first of a full update can say "forget what you have".
 
     All but the last carry the version the update is based on, so that a client that misses the rest asks again.
     """
-    points = update.points
-    xyz = (points.points_mm - points.origin_mm).astype("<f4")
-    density = points.density_per_mm2.astype("<f4")
-    normal = points.normals.astype("<f4")
-    state = state_bits(update).astype("<u4")
-    rows = update.rows.astype("<u4")
-    starts = range(0, max(1, len(rows)), MAX_POINTS)
-    messages = []
-    for start in starts:
-        part = slice(start, start + MAX_POINTS)
-        is_last = start + MAX_POINTS >= len(rows)
-        header = HEADER.pack(
-            MAGIC,
-            KIND_POINTS,
-            FLAG_FULL if update.is_full and start == 0 else 0,
-            update.version if is_last else update.based_on,
-            update.based_on,
-            len(rows[part]),
-            update.skipped,
-            update.total,
-            0,
-        )
-        arrays = (rows[part], xyz[part], density[part], normal[part], state[part])
-        messages.append(header + b"".join(array.tobytes() for array in arrays))
-    return messages
+    points, changes = page.points, page.changes
+    header = HEADER.pack(
+        MAGIC,
+        KIND_POINTS,
+        FLAG_FULL if changes.rows is None and page.is_first else 0,
+        changes.version if page.is_last else changes.based_on,
+        changes.based_on,
+        len(page.rows),
+        changes.skipped,
+        changes.total,
+        0,
+    )
+    arrays = (
+        page.rows.astype("<u4"),
+        (points.points_mm - points.origin_mm).astype("<f4"),
+        points.density_per_mm2.astype("<f4"),
+        points.normals.astype("<f4"),
+        state_bits(page).astype("<u4"),
+    )
+    return header + b"".join(array.tobytes() for array in arrays)

@@ -20,7 +20,7 @@ from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.sources import PushSource, Source
-from scanner_service.sessions.updates import Update, VerdictBook, update_since
+from scanner_service.sessions.updates import Changes, PointPage, VerdictBook, changes_since, read_page
 from scanner_service.sessions.withdrawals import WITHDRAWN, withdrawn_passes
 from scanner_service.storage.errors import RecordError
 from scanner_service.storage.record import Record
@@ -206,9 +206,13 @@ class LiveSession:
 
     # -- what a reader asks -------------------------------------------------------------------------------------
 
-    def update_since(self, version: int) -> "Future[Update]":
-        """Everything that changed after `version` of the map; 0 asks for all."""
-        return self.engine.ask(lambda engine: update_since(engine.live_map, self.verdicts, version))
+    def changes_since(self, version: int) -> "Future[Changes]":
+        """Which points changed after `version` of the map; 0 asks for all."""
+        return self.engine.ask(lambda engine: changes_since(engine.live_map, version))
+
+    def read_page(self, changes: Changes, start: int, count: int) -> "Future[PointPage]":
+        """What is said of the changed points from number `start` on, at most `count` of them."""
+        return self.engine.ask(lambda engine: read_page(engine.live_map, self.verdicts, changes, start, count))
 
     def results(self) -> Results | None:
         """The latest verdict; None before the first."""

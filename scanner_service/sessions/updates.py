@@ -10,21 +10,36 @@ from scanner_service.sessions.results import Verdict
 
 
 @dataclass(frozen=True, slots=True)
-class Update:
-    """The points that changed after `based_on`, as they are at `version`.
+class Changes:
+    """Which points changed after version `based_on` of the map, up to `version`; what is said of them is read in pages.
 
-    `rows` (m,) are their rows in the map of `total` points; `points` (m rows) and `verdict` (m,) what is said of them.
-    `is_full`: the client must forget what it has, the update holds every point. `skipped`: versions merged into it.
+    `rows` (m,) are their rows in the map of `total` points, None for all of them: then the client must forget what it
+    has. `skipped`: versions merged into this one.
     """
 
     version: int
     based_on: int
     total: int
+    rows: Int32Array | None
+    skipped: int
+
+    def __len__(self) -> int:
+        return self.total if self.rows is None else len(self.rows)
+
+
+@dataclass(frozen=True, slots=True)
+class PointPage:
+    """A part of the changed points: rows (k,), what the map says of them, and the verdict (k,).
+
+    A page read later says what holds later; what changes after `changes.version` is announced once more anyway.
+    """
+
+    changes: Changes
     rows: Int32Array
     points: MapSnapshot
     verdict: Verdict
-    is_full: bool
-    skipped: int
+    is_first: bool
+    is_last: bool
 
 
 class VerdictBook:
@@ -57,20 +72,23 @@ class VerdictBook:
         return Verdict(rescan, reason)
 
 
-def update_since(live_map: LiveMap, verdicts: VerdictBook, version: int) -> Update:
-    """Evaluate what is stale, and gather everything that changed after `version`."""
+def changes_since(live_map: LiveMap, version: int) -> Changes:
+    """Evaluate what is stale, and tell what changed after `version`; 0, or a version too long ago, asks for all."""
     live_map.refresh()
     rows = live_map.changed_since(version) if version > 0 else None
-    is_full = rows is None
-    if rows is None:
-        rows = np.arange(len(live_map), dtype=np.int32)
-    return Update(
+    return Changes(
         version=live_map.version,
-        based_on=0 if is_full else version,
+        based_on=0 if rows is None else version,
         total=len(live_map),
         rows=rows,
-        points=live_map.rows(rows),
-        verdict=verdicts.of(rows),
-        is_full=is_full,
-        skipped=0 if is_full else max(0, live_map.version - version - 1),
+        skipped=0 if rows is None else max(0, live_map.version - version - 1),
+    )
+
+
+def read_page(live_map: LiveMap, verdicts: VerdictBook, changes: Changes, start: int, count: int) -> PointPage:
+    """The changed points from number `start` on, at most `count` of them."""
+    end = min(start + count, len(changes))
+    rows = np.arange(start, end, dtype=np.int32) if changes.rows is None else changes.rows[start:end]
+    return PointPage(
+        changes, rows, live_map.rows(rows), verdicts.of(rows), is_first=start == 0, is_last=end >= len(changes)
     )

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import json
-from collections import deque
 
 from fastapi import APIRouter, Depends, WebSocket
 from starlette.concurrency import run_in_threadpool
@@ -11,7 +10,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from scanner_service.api.answers import plain
 from scanner_service.api.keys import Role
-from scanner_service.api.live_frames import point_messages
+from scanner_service.api.live_frames import MAX_POINTS, point_message
 from scanner_service.api.routes.sessions import status_answer
 from scanner_service.api.scopes import accepted_subprotocol, require
 from scanner_service.sessions.errors import SessionError
@@ -114,25 +113,25 @@ async def _listen(websocket: WebSocket, credit: _Credit) -> None:
 async def _send_points(websocket: WebSocket, session: LiveSession, credit: _Credit, greeted: asyncio.Event) -> None:
     """Send what changed, at most 30 times a second, whenever there is credit; until nothing can change any more."""
     version = 0
-    waiting: deque[bytes] = deque()
     has_sent = False
     await greeted.wait()
     while True:
         await credit.granted.wait()
-        if not waiting:
-            is_final = _is_final(session)  # looked at before the question: its answer is the last word then
-            update = await asyncio.wrap_future(session.update_since(version))
-            if len(update.rows) == 0 and has_sent:
-                if is_final:
-                    return
-                await asyncio.sleep(UPDATE_PERIOD_S)
-                continue
-            version = update.version
-            waiting.extend(await asyncio.to_thread(point_messages, update))
-        while waiting and credit.left:
+        is_final = _is_final(session)  # looked at before the question: its answer is the last word then
+        changes = await asyncio.wrap_future(session.changes_since(version))
+        if len(changes) == 0 and has_sent:
+            if is_final:
+                return
+            await asyncio.sleep(UPDATE_PERIOD_S)
+            continue
+        for start in range(0, max(1, len(changes)), MAX_POINTS):
+            await credit.granted.wait()
+            page = await asyncio.wrap_future(session.read_page(changes, start, MAX_POINTS))
+            message = await asyncio.to_thread(point_message, page)
             credit.spend()
-            await websocket.send_bytes(waiting.popleft())
-            has_sent = True
+            await websocket.send_bytes(message)
+        has_sent = True
+        version = changes.version
         await asyncio.sleep(UPDATE_PERIOD_S)
 
 
