@@ -6,7 +6,6 @@ no session, no database and no client.
 """
 
 import math
-from collections import deque
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -15,6 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.scanline import Float64Array
+from scanner_service.analysis.change_log import ChangeLog
+from scanner_service.analysis.describing import describe
 from scanner_service.analysis.errors import MapFull
 from scanner_service.analysis.flexible import flexible_radii_mm
 from scanner_service.analysis.global_radius import GlobalRadius
@@ -37,7 +38,6 @@ from scanner_service.analysis.points import (
     NOT_COUNTED,
     PointArray,
     reserve_points,
-    used_radius_mm,
     write_points,
 )
 from scanner_service.analysis.radius import RadiusSettings, line_radius, point_spacing_mm
@@ -109,8 +109,7 @@ class LiveMap:
         self._listed: Int32Array = np.empty(self.settings.max_points, dtype=np.int32)
         self._listed_used = 0
         self._pending: list[Int32Array] = []
-        self._history: deque[tuple[int, Int32Array]] = deque()
-        self._history_rows = 0
+        self._changes = ChangeLog()
         self._rules = Rules(
             needs_lines=self.settings.needs_lines,
             noise_mm=self.settings.noise_mm,
@@ -339,10 +338,7 @@ class LiveMap:
         rows = np.concatenate(changed)
         if len(rows):
             self.version = version
-            self._history.append((version, rows))
-            self._history_rows += len(rows)
-            while len(self._history) > 1 and self._history_rows > 2 * self._used:
-                self._history_rows -= len(self._history.popleft()[1])
+            self._changes.append(version, rows, keep_rows=2 * self._used)
         return rows
 
     def read_version(self) -> int:
@@ -352,12 +348,7 @@ class LiveMap:
 
     def changed_since(self, version: int) -> Int32Array | None:
         """The rows that changed after `version`, sorted; None when that is too long ago, and all must be read."""
-        if version >= self.version:
-            return np.empty(0, dtype=np.int32)
-        if not self._history or self._history[0][0] > version + 1:
-            return None
-        newer = [rows for at, rows in self._history if at > version]
-        return np.sort(newer[0]) if len(newer) == 1 else np.unique(np.concatenate(newer))
+        return self._changes.since(version)
 
     def snapshot(self) -> MapSnapshot:
         """Everything the map says, evaluated to the last line taken in; a copy that the engine never touches again."""
@@ -366,37 +357,14 @@ class LiveMap:
 
     def rows(self, rows: Int32Array) -> MapSnapshot:
         """The given rows as they were last evaluated; `line` still refers to the whole line table."""
-        points = self._points[rows]
-        radius = used_radius_mm(points, self._rules.max_radius_mm)
-        neighbours = np.ascontiguousarray(points["neighbours"])
-        unreliable = np.ascontiguousarray(points["unreliable"])
-        counted = unreliable != NOT_COUNTED
-        settled = points["open_passes"] == 0
-        normals = np.column_stack([points["nx"], points["ny"], points["nz"]]).astype(np.float64)
-        normals /= np.sqrt((normals * normals).sum(axis=1, keepdims=True))
-        smallest = points["smallest_mm2"].astype(np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            residual = np.sqrt(np.where(neighbours > 3, smallest / (neighbours - 3.0), np.nan))
-            error = np.fmax(residual, self.settings.noise_mm) / np.sqrt(points["middle_mm2"].astype(np.float64))
-        return MapSnapshot(
+        return describe(
+            self._points[rows],
             version=self.version,
-            origin_mm=self.origin_mm.copy(),
-            points_mm=self.origin_mm + np.column_stack([points["x"], points["y"], points["z"]]) * QUANTUM_MM,
+            origin_mm=self.origin_mm,
             line=self._lines.line_of(rows),
-            index=np.ascontiguousarray(points["place"]),
-            radius_mm=radius,
-            radius_rule=np.where(points["growth"] > 0, np.uint8(RadiusRule.GROWN), points["rule"]),
-            neighbours=neighbours,
-            same_side=neighbours - points["other_side"],
-            density_per_mm2=neighbours / (math.pi * radius * radius),
-            normals=normals,
-            unreliable=unreliable,
-            settled=settled,
-            isolated=settled & (neighbours <= 3) & counted,
-            offset=np.sqrt(points["offset_sq"].astype(np.float64)),
-            residual_mm=residual,
-            normal_error_rad=np.where(np.isfinite(error) & (neighbours > 3), error, np.nan),
             lines=self._lines.table(),
+            noise_mm=self.settings.noise_mm,
+            max_radius_mm=self._rules.max_radius_mm,
         )
 
     def _line_state(self) -> Lines:

@@ -210,7 +210,7 @@ def test_a_version_too_old_asks_for_everything():
         live.add(line)
         live.refresh()
     assert live.changed_since(live.version).size == 0
-    live._history.popleft()
+    live._changes.forget_oldest()
     assert live.changed_since(0) is None
 
 
