@@ -7,7 +7,6 @@ asks the engine, which answers between two scanlines.
 import logging
 import queue
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -51,20 +50,17 @@ class Engine:
         record: Record,
         settings: MapSettings,
         origin_mm: Float64Array,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.session_id = session_id
         self.ledger = Ledger()
         self.live_map = LiveMap(settings, origin_mm)
         self.failure: str | None = None
         self._record = record
-        self._clock = clock
         self._seen: set[tuple[str, int, int]] = set()
         self._open: dict[str, PassKey] = {}
         self._inbox: queue.Queue[_Line | _Ask | None] = queue.Queue(INBOX_LINES)
         self._ended = threading.Event()  # set before the inbox is emptied for the last time: see `_hand_over`
         self._thread = threading.Thread(target=self._run, name=f"engine-{session_id}", daemon=True)
-        self.busy_s = 0.0
 
     # -- for other threads --------------------------------------------------------------------------------------
 
@@ -131,7 +127,6 @@ class Engine:
             message = self._inbox.get()
             if message is None:
                 break
-            begun = self._clock()
             try:
                 if isinstance(message, _Line):
                     self._take(message)
@@ -141,7 +136,6 @@ class Engine:
                 _LOG.exception("the engine of session %s stopped", self.session_id)
                 self.failure = f"the session stopped by an internal fault: {error}"
                 break
-            self.busy_s += self._clock() - begun
         self._ended.set()
         self._refuse_the_rest()
         self.live_map.close()

@@ -64,7 +64,7 @@ class LiveSession:
         self.row = row
         self.settings = SessionSettings.from_dict(row.settings)
         self.source = source
-        self.engine = Engine(row.session_id, record, self.settings.map_settings(), np.array(row.origin_mm), clock)
+        self.engine = Engine(row.session_id, record, self.settings.map_settings(), np.array(row.origin_mm))
         self.verdicts = VerdictBook()
         self._record = record
         self._clock = clock
