@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from scanner_service.analysis.gathering import gather_wide
-from scanner_service.analysis.grid import Grid, cell_of
+from scanner_service.analysis.gathering import gather_from, rings_for
+from scanner_service.analysis.grid import Grid, place_of
 from scanner_service.analysis.intake import QUANTUM_MM
 from scanner_service.analysis.kernel_rules import Rules
 from scanner_service.analysis.points import PointArray
@@ -19,23 +19,22 @@ _REACHES = 1.0 + 1e-15
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def choose_flexible_radius(grid, points, row, cell, near, n, wide, n_wide, distances, rules):
+def choose_flexible_radius(grid, points, row, block, place, near, n, wide, n_wide, distances, rules):
     """Set the point's radius to the distance of its 20th point, between c and r_max.
 
     Returns the buffer whose points cover that radius and how many they are, and the wide buffer with its count, which
-    is gathered at most once a cell. A point that looks beyond the neighbouring cells makes its cell needy.
+    is gathered at most once a cell.
     """
     limit = math.floor((rules.max_radius_mm / QUANTUM_MM) ** 2)
-    certain = float(grid.side_q[0]) ** 2  # the cells around hold everything as near as one side
+    side_q = grid.side_q[0]
+    certain = float(side_q - 1) ** 2  # the cells around hold everything as near as one side
     found = _twentieth(points, row, near, n, distances)
     local, n_local = near, n
-    if found > certain and rules.max_radius_mm > grid.side_q[0] * QUANTUM_MM:
+    if found > certain and rings_for(rules.max_radius_mm, side_q) > 1:
         if n_wide < 0:
-            wide, n_wide = gather_wide(grid, cell, rules.max_radius_mm, wide)
+            wide, n_wide = gather_from(grid, block, place, rings_for(rules.max_radius_mm, side_q), wide)
         found = _twentieth(points, row, wide, n_wide, distances)
         local, n_local = wide, n_wide
-        grid.cell_needy[cell] = 1
-        grid.block_needy[grid.cell_block[cell]] = 1
     if found > limit:
         radius_mm = rules.max_radius_mm
     else:
@@ -97,15 +96,15 @@ def flexible_radii_mm(rows: Int32Array, grid: Grid, points: PointArray, rules: R
     """The flexible radius of each row, put into `radii` (m,); the points keep theirs."""
     wide = np.empty((4, 512))
     distances = np.empty(512)
-    side = grid.side_q[0]
+    rings = rings_for(rules.max_radius_mm, grid.side_q[0])
     limit = math.floor((rules.max_radius_mm / QUANTUM_MM) ** 2)
     for i in range(len(rows)):
         row = rows[i]
-        cell = cell_of(grid, points[row].x // side, points[row].y // side, points[row].z // side)
+        block, place = place_of(grid, points[row].x, points[row].y, points[row].z)
         radii[i] = rules.max_radius_mm
-        if cell < 0:
+        if block < 0:
             continue
-        wide, n = gather_wide(grid, cell, rules.max_radius_mm, wide)
+        wide, n = gather_from(grid, block, place, rings, wide)
         found = _twentieth(points, row, wide, n, distances)
         if found <= limit:
             radii[i] = max(QUANTUM_MM * math.sqrt(found) * _REACHES, rules.uncertainty_mm)

@@ -5,7 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
-from scanner_service.analysis.grid import CHUNK, cell_near
+from scanner_service.analysis.around import AROUND_COUNT, AROUND_MASK, AROUND_NEAR, RINGS, lowest_bit
+from scanner_service.analysis.grid import CHUNK, LINE, ROW, X, Y, Z
 from scanner_service.analysis.intake import QUANTUM_MM
 
 VECTOR = 16
@@ -15,90 +16,115 @@ _FAR = 1e15
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def cells_around(cell_at, cell_block, cell_count, block_key, block_near, block_cell, cell, rings, found):
-    """Put the cells up to `rings` away into `found`; returns how many, and how many points they hold."""
-    n_found = 0
-    n_points = np.int64(0)
-    for dx in range(-rings, rings + 1):
-        for dy in range(-rings, rings + 1):
-            for dz in range(-rings, rings + 1):
-                other = cell_near(cell_at, cell_block, block_key, block_near, block_cell, cell, dx, dy, dz)
-                if other >= 0:
-                    found[n_found] = other
-                    n_found += 1
-                    n_points += cell_count[other]
-    return n_found, n_points
+def rings_for(radius_mm, side_q):
+    """How many cells far a point with this radius looks; more than RINGS are never needed."""
+    return min(RINGS, math.ceil((radius_mm / QUANTUM_MM + 1.0) / side_q))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_found, buffer):
-    """Copy x, y, z and line of every point in the cells found, and pad."""
-    n = 0
-    for k in range(n_found):
-        chunk = cell_first[found[k]]
-        left = cell_count[found[k]]
-        while left > 0:
-            here = min(left, CHUNK)
-            for j in range(CHUNK):  # a whole chunk at once: what is beyond its end is overwritten or padded
-                buffer[0, n + j] = chunk_xyz[chunk, 0, j]
-                buffer[1, n + j] = chunk_xyz[chunk, 1, j]
-                buffer[2, n + j] = chunk_xyz[chunk, 2, j]
-                buffer[3, n + j] = chunk_line[chunk, j]
-            n += here
-            left -= here
-            chunk = chunk_next[chunk]
-    for j in range(VECTOR):
-        buffer[0, n + j] = _FAR
-        buffer[1, n + j], buffer[2, n + j], buffer[3, n + j] = 0.0, 0.0, 0.0
+def gather(block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk, block, place, rings, buffer):
+    """Copy x, y, z and line of every point in the cells up to `rings` away, and pad.
+
+    Returns the buffer (4, N), a larger one if need be, and how many points it holds.
+    """
+    n = np.int64(0)
+    room = buffer.shape[1] - VECTOR
+    for k in range(AROUND_COUNT[rings, place]):
+        other = np.int64(block_near[block, AROUND_NEAR[rings, place, k]])
+        if other < 0:
+            continue
+        mask = block_filled[other] & AROUND_MASK[rings, place, k]
+        while mask != np.uint64(0):
+            cell = np.int64(block_cell[other, lowest_bit(mask)])
+            mask &= mask - np.uint64(1)
+            left = np.int64(cell_count[cell])
+            if n + left > room:
+                buffer = _enlarged(buffer, n, n + left)
+                room = buffer.shape[1] - VECTOR
+            here = np.int64(cell_first[cell])
+            while True:
+                for at in range(CHUNK):  # a whole chunk at once: what is beyond its end is overwritten or padded
+                    buffer[0, n + at] = chunk[here, X, at]
+                    buffer[1, n + at] = chunk[here, Y, at]
+                    buffer[2, n + at] = chunk[here, Z, at]
+                    buffer[3, n + at] = chunk[here, LINE, at]
+                n += min(left, CHUNK)
+                left -= CHUNK
+                if left <= 0:
+                    break
+                here = np.int64(chunk_next[here])
+    for at in range(VECTOR):
+        buffer[0, n + at] = _FAR
+        buffer[1, n + at], buffer[2, n + at], buffer[3, n + at] = 0.0, 0.0, 0.0
+    return buffer, n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _enlarged(buffer, used, wanted):
+    """A buffer with room for twice what is wanted, holding what was used."""
+    larger = np.empty((4, 2 * wanted + VECTOR))
+    larger[:, :used] = buffer[:, :used]
+    return larger
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def gather_from(grid, block, place, rings, buffer):
+    """The same as `gather`, for those who do it now and then."""
+    return gather(
+        grid.block_near, grid.block_filled, grid.block_cell, grid.cell_first, grid.cell_count,
+        grid.chunk_next, grid.chunk, block, place, rings, buffer,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def has_fresh(block_near, block_fresh, block, place, rings):
+    """True when a cell up to `rings` away is fresh."""
+    for k in range(AROUND_COUNT[rings, place]):
+        other = np.int64(block_near[block, AROUND_NEAR[rings, place, k]])
+        if other >= 0 and block_fresh[other] & AROUND_MASK[rings, place, k] != np.uint64(0):
+            return True
+    return False
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def gather_fresh(
-    chunk_next, chunk_xyz, chunk_point, cell_first, cell_last, cell_count, found, n_found, first_new, fresh
-):
-    """Copy the coordinates of those points in the cells found that are new, and pad; returns how many."""
+    block_near, block_fresh, block_cell, cell_first, cell_count, chunk_next, chunk,
+    block, place, rings, first_new, fresh,
+):  # fmt: skip
+    """Copy the coordinates of the new points in the fresh cells up to `rings` away, and pad, as `gather` does."""
     n = np.int64(0)
-    for k in range(n_found):
-        cell = found[k]
-        if chunk_point[cell_last[cell], (cell_count[cell] - 1) % CHUNK] < first_new:
-            continue  # rows of a cell ascend: its last is its newest
-        chunk = cell_first[cell]
-        left = cell_count[cell]
-        while left > 0:
-            here = min(left, CHUNK)
-            for j in range(here):
-                if chunk_point[chunk, j] >= first_new:
-                    fresh[0, n] = chunk_xyz[chunk, 0, j]
-                    fresh[1, n] = chunk_xyz[chunk, 1, j]
-                    fresh[2, n] = chunk_xyz[chunk, 2, j]
-                    n += 1
-            left -= here
-            chunk = chunk_next[chunk]
-    return n
+    for k in range(AROUND_COUNT[rings, place]):
+        other = np.int64(block_near[block, AROUND_NEAR[rings, place, k]])
+        if other < 0:
+            continue
+        mask = block_fresh[other] & AROUND_MASK[rings, place, k]
+        while mask != np.uint64(0):
+            cell = np.int64(block_cell[other, lowest_bit(mask)])
+            mask &= mask - np.uint64(1)
+            here = np.int64(cell_first[cell])
+            left = np.int64(cell_count[cell])
+            if n + left + VECTOR > fresh.shape[1]:
+                fresh = _enlarged(fresh, n, n + left)
+            while left > 0:
+                for at in range(min(left, CHUNK)):
+                    if chunk[here, ROW, at] >= first_new:
+                        fresh[0, n] = chunk[here, X, at]
+                        fresh[1, n] = chunk[here, Y, at]
+                        fresh[2, n] = chunk[here, Z, at]
+                        n += 1
+                left -= CHUNK
+                here = np.int64(chunk_next[here])
+    padded = ((n + VECTOR - 1) // VECTOR) * VECTOR
+    for at in range(n, padded):
+        fresh[0, at], fresh[1, at], fresh[2, at] = _FAR, 0.0, 0.0
+    return fresh, n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def is_reached(points, row, fresh, n_fresh):
-    """True when a new point lies within the radius of a point."""
-    x, y, z = float(points[row].x), float(points[row].y), float(points[row].z)
-    reach = math.floor((points[row].radius_mm / QUANTUM_MM) ** 2)
-    reached = False
-    for k in range(n_fresh):
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "nnan"})
+def is_reached(x, y, z, reach, fresh, n_fresh):
+    """True when one of the new points lies within a squared distance of (x, y, z)."""
+    reached = 0.0
+    for k in range(((n_fresh + VECTOR - 1) // VECTOR) * VECTOR):
         dx, dy, dz = fresh[0, k] - x, fresh[1, k] - y, fresh[2, k] - z
-        reached |= dx * dx + dy * dy + dz * dz <= reach + 1.0
-    return reached
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def gather_wide(grid, cell, limit_mm, wide):
-    """All points as far as a radius may grow: the buffer, a larger one if need be, and how many it holds."""
-    rings = min(4, math.ceil(limit_mm / (grid.side_q[0] * QUANTUM_MM)))
-    found = np.empty(729, dtype=np.int64)
-    n_found, n = cells_around(
-        grid.cell_at, grid.cell_block, grid.cell_count, grid.block_key, grid.block_near, grid.block_cell,
-        cell, rings, found,
-    )  # fmt: skip
-    if n + VECTOR > wide.shape[1]:
-        wide = np.empty((4, 2 * n + VECTOR))
-    gather(grid.chunk_next, grid.chunk_xyz, grid.chunk_line, grid.cell_first, grid.cell_count, found, n_found, wide)
-    return wide, n
+        reached += 1.0 if dx * dx + dy * dy + dz * dz <= reach else 0.0
+    return reached > 0.0
