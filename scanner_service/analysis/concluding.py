@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numba import njit
 
-from scanner_service.analysis.gathering import gather_from, rings_for
+from scanner_service.analysis.gathering import gather, rings_for
 from scanner_service.analysis.growing import grow, look_far, reach_mm
-from scanner_service.analysis.intake import QUANTUM_MM
+from scanner_service.analysis.intake import PER_MM, QUANTUM_MM
 from scanner_service.analysis.judging import reason_against
 from scanner_service.analysis.kernel_rules import radius_limit_mm
 from scanner_service.analysis.plane import fit_column, fit_planes
@@ -19,7 +19,7 @@ BATCH = 64
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def conclude(batch, sums, fits, n, grid, points, lines, rules, version, is_exact, changed, n_changed):
+def conclude(batch, sums, fits, n, grid, points, lines, rules, version, is_exact, scratch, changed, n_changed):
     """Fit a batch of points, let radii grow where that is needed, store the answers; the new number of changed rows.
 
     `batch` (5, BATCH) holds row, block, place, scanline and the open passes in reach. Where, and only where, the rule's
@@ -27,8 +27,10 @@ def conclude(batch, sums, fits, n, grid, points, lines, rules, version, is_exact
     """
     laser_q, pass_bit, heading, front_q = lines.laser_q, lines.pass_bit, lines.heading, lines.front_q
     block_near, block_far, block_laser_q = grid.block_near, grid.block_far, grid.block_laser_q
-    waits, side_q = lines.waits, grid.side_q[0]
-    wide = np.empty((4, 1024))
+    block_filled, block_cell, chunk_next, chunk = grid.block_filled, grid.block_cell, grid.chunk_next, grid.chunk
+    cell_first, cell_count, side_q = grid.cell_first, grid.cell_count, grid.side_q[0]
+    waits, open_bits = lines.waits, lines.open_bits[0]
+    wide, kept = scratch.wide, scratch.kept
     n_wide, wide_rings, wide_at = np.int64(0), np.int64(0), np.int64(-1)
     laser_box_q = np.empty((2, 3))
     boxed = np.int64(-1)
@@ -44,13 +46,14 @@ def conclude(batch, sums, fits, n, grid, points, lines, rules, version, is_exact
         step = 0
         radius_mm = points[row].radius_mm
         if reason != 0 and not rules.is_flexible and radius_limit_mm(radius_mm, rules) > radius_mm:
-            step, radius_mm, wide, n_wide, wide_rings = grow(
-                grid, points, row, block, place, own, is_exact, rules, sums, fits, i, wide, n_wide, wide_rings
-            )
+            step, radius_mm, n_wide, wide_rings = grow(
+                block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk, side_q,
+                points, row, block, place, own, is_exact, rules, sums, fits, i, kept, wide, n_wide, wide_rings,
+            )  # fmt: skip
             if step > 0:
                 reason = 0
-                if lines.open_bits[0] & ~passes:
-                    reach = math.floor((radius_mm / QUANTUM_MM) ** 2)
+                if open_bits & ~passes:
+                    reach = math.floor((radius_mm * PER_MM) ** 2)
                     passes = passes_in_reach(points, row, passes, wide, n_wide, reach, pass_bit)
         other_side = 0
         if reason == 0:
@@ -61,7 +64,10 @@ def conclude(batch, sums, fits, n, grid, points, lines, rules, version, is_exact
             if may_be_seen_from_below(points, row, fits, i, radius_mm, laser_box_q):
                 rings = rings_for(radius_mm, side_q)
                 if rings > wide_rings:
-                    wide, n_wide = gather_from(grid, block, place, rings, wide)
+                    n_wide = gather(
+                        block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk,
+                        block, place, rings, wide,
+                    )  # fmt: skip
                     wide_rings = rings
                 other_side = count_other_side(points, row, wide, n_wide, radius_mm, laser_q, fits, i)
         passes = not_gone_by(passes, points, row, heading, front_q, rules)
@@ -75,7 +81,7 @@ def conclude(batch, sums, fits, n, grid, points, lines, rules, version, is_exact
     return n_changed
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _store(points, row, sums, fits, i, reason, radius_mm, step, passes, other_side, version):
     """Write an answer into the point's record; True when it differs from the one before."""
     count = np.int32(sums[0, i])

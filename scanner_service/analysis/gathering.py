@@ -1,12 +1,15 @@
 """Fetching the points around a cell into a buffer for the kernels; judges nothing."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
+from drivers.scanline import Float64Array
 from scanner_service.analysis.around import AROUND_COUNT, AROUND_MASK, AROUND_NEAR, RINGS, lowest_bit
-from scanner_service.analysis.grid import CHUNK, LINE, ROW, X, Y, Z
+from scanner_service.analysis.grid import CHUNK, ROW, X, Y, Z
+from scanner_service.analysis.vector_copy import widen_eight
 from scanner_service.analysis.intake import QUANTUM_MM
 
 VECTOR = 16
@@ -15,20 +18,39 @@ VECTOR = 16
 _FAR = 1e15
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def rings_for(radius_mm, side_q):
     """How many cells far a point with this radius looks; more than RINGS are never needed."""
     return min(RINGS, math.ceil((radius_mm / QUANTUM_MM + 1.0) / side_q))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def gather(block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk, block, place, rings, buffer):
-    """Copy x, y, z and line of every point in the cells up to `rings` away, and pad.
+class Scratch(NamedTuple):
+    """Buffers of one thread, large enough for the fullest cells, of which only what is touched becomes memory.
 
-    Returns the buffer (4, N), a larger one if need be, and how many points it holds.
+    `near`, `wide` and `fresh` (4, N) hold x, y, z and line of points around; `squares` (N,) distances; `kept` (21,)
+    sums and fit of one point.
+    """
+
+    near: Float64Array
+    wide: Float64Array
+    fresh: Float64Array
+    squares: Float64Array
+    kept: Float64Array
+
+
+def reserve_scratch(cell_limit: int) -> Scratch:
+    """Buffers for cells of at most `cell_limit` points."""
+    around, far = 27 * cell_limit + 2 * VECTOR, (2 * RINGS + 1) ** 3 * cell_limit + 2 * VECTOR
+    return Scratch(np.empty((4, around)), np.empty((4, far)), np.empty((4, far)), np.empty(far), np.empty(21))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def gather(block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk, block, place, rings, buffer):
+    """Copy x, y, z and line of every point in the cells up to `rings` away into the buffer (4, N), and pad.
+
+    Returns how many points there are.
     """
     n = np.int64(0)
-    room = buffer.shape[1] - VECTOR
     for k in range(AROUND_COUNT[rings, place]):
         other = np.int64(block_near[block, AROUND_NEAR[rings, place, k]])
         if other < 0:
@@ -37,17 +59,11 @@ def gather(block_near, block_filled, block_cell, cell_first, cell_count, chunk_n
         while mask != np.uint64(0):
             cell = np.int64(block_cell[other, lowest_bit(mask)])
             mask &= mask - np.uint64(1)
-            left = np.int64(cell_count[cell])
-            if n + left > room:
-                buffer = _enlarged(buffer, n, n + left)
-                room = buffer.shape[1] - VECTOR
             here = np.int64(cell_first[cell])
+            left = np.int64(cell_count[cell])
             while True:
-                for at in range(CHUNK):  # a whole chunk at once: what is beyond its end is overwritten or padded
-                    buffer[0, n + at] = chunk[here, X, at]
-                    buffer[1, n + at] = chunk[here, Y, at]
-                    buffer[2, n + at] = chunk[here, Z, at]
-                    buffer[3, n + at] = chunk[here, LINE, at]
+                for column in range(4):  # a whole chunk at once: what is beyond its end is overwritten or padded
+                    widen_eight(chunk, here, column, buffer, n)
                 n += min(left, CHUNK)
                 left -= CHUNK
                 if left <= 0:
@@ -56,27 +72,10 @@ def gather(block_near, block_filled, block_cell, cell_first, cell_count, chunk_n
     for at in range(VECTOR):
         buffer[0, n + at] = _FAR
         buffer[1, n + at], buffer[2, n + at], buffer[3, n + at] = 0.0, 0.0, 0.0
-    return buffer, n
+    return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _enlarged(buffer, used, wanted):
-    """A buffer with room for twice what is wanted, holding what was used."""
-    larger = np.empty((4, 2 * wanted + VECTOR))
-    larger[:, :used] = buffer[:, :used]
-    return larger
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def gather_from(grid, block, place, rings, buffer):
-    """The same as `gather`, for those who do it now and then."""
-    return gather(
-        grid.block_near, grid.block_filled, grid.block_cell, grid.cell_first, grid.cell_count,
-        grid.chunk_next, grid.chunk, block, place, rings, buffer,
-    )  # fmt: skip
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def has_fresh(block_near, block_fresh, block, place, rings):
     """True when a cell up to `rings` away is fresh."""
     for k in range(AROUND_COUNT[rings, place]):
@@ -103,8 +102,6 @@ def gather_fresh(
             mask &= mask - np.uint64(1)
             here = np.int64(cell_first[cell])
             left = np.int64(cell_count[cell])
-            if n + left + VECTOR > fresh.shape[1]:
-                fresh = _enlarged(fresh, n, n + left)
             while left > 0:
                 for at in range(min(left, CHUNK)):
                     if chunk[here, ROW, at] >= first_new:
@@ -114,10 +111,9 @@ def gather_fresh(
                         n += 1
                 left -= CHUNK
                 here = np.int64(chunk_next[here])
-    padded = ((n + VECTOR - 1) // VECTOR) * VECTOR
-    for at in range(n, padded):
-        fresh[0, at], fresh[1, at], fresh[2, at] = _FAR, 0.0, 0.0
-    return fresh, n
+    for at in range(VECTOR):
+        fresh[0, n + at], fresh[1, n + at], fresh[2, n + at] = _FAR, 0.0, 0.0
+    return n
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "nnan"})

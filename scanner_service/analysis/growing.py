@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numba import njit
 
-from scanner_service.analysis.gathering import gather_from, rings_for
-from scanner_service.analysis.intake import QUANTUM_MM
+from scanner_service.analysis.gathering import gather, rings_for
+from scanner_service.analysis.intake import PER_MM
 from scanner_service.analysis.judging import reason_against
 from scanner_service.analysis.kernel_rules import radius_limit_mm
 from scanner_service.analysis.plane import fit_column
@@ -16,7 +16,7 @@ from scanner_service.analysis.sums import put, sums_within
 _STEPS = np.array([GROWTH**step for step in range(32)])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def reach_mm(points, row, rules):
     """How far away something must stay for the point's answer to stand: its radius, after all growing that was tried."""
     base_mm = points[row].radius_mm
@@ -28,7 +28,7 @@ def reach_mm(points, row, rules):
     return limit_mm
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def look_far(block_far, block, place, rings):
     """Note that a point of a cell looks `rings` cells far."""
     for k in range(rings - 1):
@@ -36,29 +36,40 @@ def look_far(block_far, block, place, rings):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def grow(grid, points, row, block, place, own, is_exact, rules, sums, fits, i, wide, n_wide, wide_rings):
+def grow(
+    block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk, side_q,
+    points, row, block, place, own, is_exact, rules, sums, fits, i, kept, wide, n_wide, wide_rings,
+):  # fmt: skip
     """Grow the radius to the first step that makes the point reliable, leaving its sums and fit in column i.
 
-    Returns the step (0 when none does, and the column is as it was), the radius, and the buffer of the cells around
-    with its count and rings, which is fetched again only when more rings are needed (`wide_rings` 0: nothing in it).
+    Returns the step (0 when none does, and the column is as it was), the radius, and how many points, of how many
+    rings, the buffer `wide` holds now; it is filled again only when more rings are needed.
     """
     base_mm = points[row].radius_mm
     limit_mm = radius_limit_mm(base_mm, rules)
-    kept_sums, kept_fits = sums[:, i].copy(), fits[:, i].copy()
+    for k in range(13):
+        kept[k] = sums[k, i]
+    for k in range(8):
+        kept[13 + k] = fits[k, i]
     step = 0
     radius_mm = base_mm
     while radius_mm < limit_mm:
         step += 1
         radius_mm = min(base_mm * _STEPS[step], limit_mm)
-        rings = rings_for(radius_mm, grid.side_q[0])
+        rings = rings_for(radius_mm, side_q)
         if rings > wide_rings:
-            wide, n_wide = gather_from(grid, block, place, rings, wide)
+            n_wide = gather(
+                block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk,
+                block, place, rings, wide,
+            )  # fmt: skip
             wide_rings = rings
-        reach = math.floor((radius_mm / QUANTUM_MM) ** 2)
+        reach = math.floor((radius_mm * PER_MM) ** 2)
         put(sums, i, sums_within(points, row, own, wide, n_wide, reach, is_exact))
         fit_column(sums, fits, i)
         if reason_against(sums, fits, i, rules) == 0:
-            return step, radius_mm, wide, n_wide, wide_rings
-    sums[:, i] = kept_sums
-    fits[:, i] = kept_fits
-    return 0, base_mm, wide, n_wide, wide_rings
+            return step, radius_mm, n_wide, wide_rings
+    for k in range(13):
+        sums[k, i] = kept[k]
+    for k in range(8):
+        fits[k, i] = kept[13 + k]
+    return 0, base_mm, n_wide, wide_rings

@@ -18,7 +18,7 @@ MIN_GAP = 1e-3
 """A plane is determined where lambda2 - lambda3 >= MIN_GAP * lambda1 (the reach of the 1e-6 rad promise)."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def reason_against(sums, fits, i, rules):
     """Why the normal of a column is not to be believed, 0 when it is."""
     total, others, first, second = sums[0, i], sums[1, i], sums[2, i], sums[3, i]

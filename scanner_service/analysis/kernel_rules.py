@@ -43,7 +43,7 @@ class Lines(NamedTuple):
     waits: UInt8Array
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def radius_limit_mm(base_mm, rules):
     """r_max of a point whose rule gave `base_mm`."""
     if rules.is_flexible:

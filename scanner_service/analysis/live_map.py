@@ -18,6 +18,7 @@ from scanner_service.analysis.change_log import ChangeLog
 from scanner_service.analysis.describing import describe
 from scanner_service.analysis.errors import MapFull
 from scanner_service.analysis.flexible import flexible_radii_mm
+from scanner_service.analysis.gathering import reserve_scratch
 from scanner_service.analysis.global_radius import GlobalRadius
 from scanner_service.analysis.grid import (
     blocks_to_evaluate,
@@ -113,6 +114,7 @@ class LiveMap:
         self._largest_radius_mm = 0.0
         self._lines = LineColumns()
         self._passes = PassBook()
+        self._scratch = [reserve_scratch(self.settings.cell_limit) for _ in range(self.settings.threads)]
         self._pending: list[Int32Array] = []
         self._changes = ChangeLog()
         self._rules = Rules(
@@ -299,7 +301,7 @@ class LiveMap:
         rows = self._global.sample()
         rows = rows[self._points["unreliable"][rows] != NOT_COUNTED]
         radii = np.empty(len(rows))
-        flexible_radii_mm(rows, self._grid, self._points, self._rules, radii)
+        flexible_radii_mm(rows, self._grid, self._points, self._rules, self._scratch[0], radii)
         radius_mm = self._global.settle_on(radii, self._used)
         if radius_mm is None:
             return
@@ -393,10 +395,12 @@ class LiveMap:
         lines = self._line_state()
 
         def work(part: Int32Array) -> Int32Array:
+            scratch = self._scratch.pop()
             changed = np.empty(count_points(part, self._grid), dtype=np.int32)
             count = evaluate_blocks(
-                part, self._grid, self._points, lines, self._rules, version, self._first_new, changed
+                part, self._grid, self._points, lines, self._rules, version, self._first_new, scratch, changed
             )
+            self._scratch.append(scratch)
             return changed[:count]
 
         if self._pool is None or len(blocks) < _SHARED_BLOCKS:

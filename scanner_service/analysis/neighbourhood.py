@@ -8,10 +8,10 @@ from numba import njit
 from scanner_service.analysis.around import lowest_bit
 from scanner_service.analysis.concluding import BATCH, conclude
 from scanner_service.analysis.flexible import choose_flexible_radius
-from scanner_service.analysis.gathering import VECTOR, gather, gather_fresh, has_fresh, is_reached, rings_for
+from scanner_service.analysis.gathering import Scratch, gather, gather_fresh, has_fresh, is_reached, rings_for
 from scanner_service.analysis.grid import CHUNK, LINE, ROW, X, Y, Z, Grid
 from scanner_service.analysis.growing import look_far, reach_mm
-from scanner_service.analysis.intake import QUANTUM_MM
+from scanner_service.analysis.intake import PER_MM
 from scanner_service.analysis.kernel_rules import Lines, Rules
 from scanner_service.analysis.points import PointArray
 from scanner_service.analysis.settling import passes_in_reach
@@ -28,6 +28,7 @@ def evaluate_blocks(
     rules: Rules,
     version: int,
     first_new: int,
+    scratch: Scratch,
     changed: Int32Array,
 ) -> int:
     """Evaluate the points of the given blocks that something fresh may have reached.
@@ -45,10 +46,8 @@ def evaluate_blocks(
     pass_bit, open_bits = lines.pass_bit, np.uint8(lines.open_bits[0])
     side_q = grid.side_q[0]
     is_exact = side_q < EXACT_SIDE_Q and len(pass_bit) < EXACT_LINES
-    near = np.empty((4, 512))
-    fresh = np.empty((4, 512))
-    wide = np.empty((4, 512))
-    distances = np.empty(512)
+    near, wide, fresh, squares = scratch.near, scratch.wide, scratch.fresh, scratch.squares
+    far_rings = rings_for(rules.max_radius_mm, side_q)
     batch = np.empty((5, BATCH), dtype=np.int64)
     sums = np.empty((13, BATCH))
     fits = np.empty((8, BATCH))
@@ -68,7 +67,7 @@ def evaluate_blocks(
             here = np.int64(cell_first[cell])
             n_fresh = np.int64(0)
             if chunk[here, ROW, 0] < first_new:  # rows of a cell ascend: its first is its oldest
-                fresh, n_fresh = gather_fresh(
+                n_fresh = gather_fresh(
                     block_near, block_fresh, block_cell, cell_first, cell_count, chunk_next, chunk,
                     block, place, rings, first_new, fresh,
                 )  # fmt: skip
@@ -81,37 +80,46 @@ def evaluate_blocks(
                     row = np.int64(chunk[here, ROW, at])
                     if row < first_new:
                         old_mm = reach_mm(points, row, rules)
-                        reach = math.floor((old_mm / QUANTUM_MM) ** 2)
+                        reach = math.floor((old_mm * PER_MM) ** 2)
                         x, y, z = float(chunk[here, X, at]), float(chunk[here, Y, at]), float(chunk[here, Z, at])
                         if not is_reached(x, y, z, reach, fresh, n_fresh):
                             look_far(block_far, block, place, rings_for(old_mm, side_q))
                             continue
                     if n < 0:
-                        near, n = gather(
+                        n = gather(
                             block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk,
                             block, place, 1, near,
                         )  # fmt: skip
                     own = np.int64(chunk[here, LINE, at])
-                    local, n_local = near, n
-                    if rules.is_flexible:
-                        local, n_local, wide, n_wide = choose_flexible_radius(
-                            grid, points, row, block, place, near, n, wide, n_wide, distances, rules
-                        )
-                        if n_local + VECTOR > len(distances):
-                            distances = np.empty(2 * n_local + VECTOR)
-                    reach = math.floor((points[row].radius_mm / QUANTUM_MM) ** 2)
-                    put(sums, n_batch, sums_within(points, row, own, local, n_local, reach, is_exact))
+                    if rules.is_flexible and not choose_flexible_radius(
+                        points, row, near, n, wide, n_wide, squares, side_q, rules
+                    ):
+                        n_wide = gather(
+                            block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk,
+                            block, place, far_rings, wide,
+                        )  # fmt: skip
+                        choose_flexible_radius(points, row, near, n, wide, n_wide, squares, side_q, rules)
+                    radius_q = points[row].radius_mm * PER_MM
+                    reach = math.floor(radius_q**2)
+                    is_near = radius_q < side_q - 0.5
+                    if is_near:
+                        put(sums, n_batch, sums_within(points, row, own, near, n, reach, is_exact))
+                    else:
+                        put(sums, n_batch, sums_within(points, row, own, wide, n_wide, reach, is_exact))
                     passes = pass_bit[own]
                     if open_bits & ~passes:
-                        passes = passes_in_reach(points, row, passes, local, n_local, reach, pass_bit)
+                        if is_near:
+                            passes = passes_in_reach(points, row, passes, near, n, reach, pass_bit)
+                        else:
+                            passes = passes_in_reach(points, row, passes, wide, n_wide, reach, pass_bit)
                     batch[0, n_batch], batch[1, n_batch], batch[2, n_batch] = row, block, place
                     batch[3, n_batch], batch[4, n_batch] = own, passes
                     n_batch += 1
                     if n_batch == BATCH:
                         n_changed = conclude(
-                            batch, sums, fits, n_batch, grid, points, lines, rules, version, is_exact, changed, n_changed
+                            batch, sums, fits, n_batch, grid, points, lines, rules, version, is_exact, scratch, changed, n_changed
                         )
                         n_batch = 0
                 left -= CHUNK
                 here = np.int64(chunk_next[here])
-    return conclude(batch, sums, fits, n_batch, grid, points, lines, rules, version, is_exact, changed, n_changed)
+    return conclude(batch, sums, fits, n_batch, grid, points, lines, rules, version, is_exact, scratch, changed, n_changed)

@@ -4,24 +4,27 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from scanner_service.analysis.intake import QUANTUM_MM
+from scanner_service.analysis.around import lowest_bit
+from scanner_service.analysis.intake import PER_MM
 from scanner_service.analysis.kernel_rules import Lines, Rules, radius_limit_mm
 from scanner_service.analysis.points import MAX_OPEN_PASSES, PointArray
 from scanner_service.analysis.snapshot import Int32Array, UInt8Array
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def not_gone_by(bits, points, row, heading, front_q, rules):
     """Of the passes in `bits`, those whose laser plane is not yet more than the point's r_max beyond it."""
-    if bits == 0:
+    left = np.uint64(bits)
+    if left == np.uint64(0):
         return bits
-    x, y, z = points[row].x, points[row].y, points[row].z
-    clearance_q = radius_limit_mm(points[row].radius_mm, rules) / QUANTUM_MM
-    for slot in range(MAX_OPEN_PASSES):
-        if bits & np.uint8(1 << slot):
-            along = heading[slot, 0] * x + heading[slot, 1] * y + heading[slot, 2] * z
-            if front_q[slot] - along > clearance_q:
-                bits &= ~np.uint8(1 << slot)
+    x, y, z = float(points[row].x), float(points[row].y), float(points[row].z)
+    clearance_q = radius_limit_mm(points[row].radius_mm, rules) * PER_MM
+    while left != np.uint64(0):
+        slot = lowest_bit(left)
+        left &= left - np.uint64(1)
+        along = heading[slot, 0] * x + heading[slot, 1] * y + heading[slot, 2] * z
+        if front_q[slot] - along > clearance_q:
+            bits &= ~np.uint8(1 << slot)
     return bits
 
 

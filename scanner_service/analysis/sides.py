@@ -8,7 +8,7 @@ from numba import njit
 from scanner_service.analysis.intake import QUANTUM_MM
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def turn_to_laser(points, row, own, laser_q, fits, i):
     """Eq. 6.11: the axis is flipped when it points away from the laser of the point's own scanline."""
     x, y, z = laser_q[own, 0] - points[row].x, laser_q[own, 1] - points[row].y, laser_q[own, 2] - points[row].z
@@ -28,7 +28,7 @@ def box_of_lasers(block_near, block_laser_q, block, box_q):
                 box_q[1, axis] = max(box_q[1, axis], block_laser_q[other, 1, axis])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def may_be_seen_from_below(points, row, fits, i, radius_mm, laser_box_q):
     """False when every laser of the neighbourhood stands so high above the point's plane that all neighbours do too."""
     lowest = -radius_mm / QUANTUM_MM

@@ -15,14 +15,14 @@ EXACT_LINES = 2**19
 """Up to this many scanlines the sums that tell one line from several are, too."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def put(sums, column, values):
     """Write the thirteen sums of a point into a column."""
     for i in range(13):
         sums[i, column] = values[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def sums_within(points, row, own, local, n, reach, is_exact):
     """The sums of `_sums`, exact for any radius."""
     px, py, pz = points[row].x, points[row].y, points[row].z
@@ -33,7 +33,7 @@ def sums_within(points, row, own, local, n, reach, is_exact):
     return _sums_of_integers(local, n, px, py, pz, own, reach)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "nnan", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={"reassoc", "nsz", "nnan", "contract"})
 def _sums(local, n, px, py, pz, own, reach):
     """Counts and moments of the candidates within reach, without a branch, for vector registers.
 
