@@ -19,36 +19,34 @@ BATCH = 64
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def conclude(batch, sums, fits, n, grid, points, lines, rules, version, is_exact, scratch, changed, n_changed):
+def conclude(
+    batch, sums, fits, n, block, bits, block_laser_q, cell, chunk_next, chunk, side_q, points,
+    laser_q, pass_bit, open_bits, heading, front_q, waits, rules, version, is_exact, wide, kept, changed, n_changed,
+):  # fmt: skip
+
     """Fit a batch of points, let radii grow where that is needed, store the answers; the new number of changed rows.
 
     `batch` (5, BATCH) holds row, block, place, scanline and the open passes in reach. Where, and only where, the rule's
     radius leaves a point unreliable, it grows; when no step helps, the answer of the rule's own radius stands.
     """
-    laser_q, pass_bit, heading, front_q = lines.laser_q, lines.pass_bit, lines.heading, lines.front_q
-    block_near, block_far, block_laser_q = grid.block_near, grid.block_far, grid.block_laser_q
-    block_filled, block_cell, chunk_next, chunk = grid.block_filled, grid.block_cell, grid.chunk_next, grid.chunk
-    cell_first, cell_count, side_q = grid.cell_first, grid.cell_count, grid.side_q[0]
-    waits, open_bits = lines.waits, lines.open_bits[0]
-    wide, kept = scratch.wide, scratch.kept
     n_wide, wide_rings, wide_at = np.int64(0), np.int64(0), np.int64(-1)
     laser_box_q = np.empty((2, 3))
     boxed = np.int64(-1)
     fit_planes(sums, n, fits)
     for i in range(n):
-        row, block, place, own = batch[0, i], batch[1, i], batch[2, i], batch[3, i]
+        row, b, place, own = batch[0, i], batch[1, i], batch[2, i], batch[3, i]
         passes = np.uint8(batch[4, i])
         if fits[6, i] == 0.0:
             fit_column(sums, fits, i)
-        if wide_at != 64 * block + place:
-            wide_at, wide_rings = 64 * block + place, np.int64(0)
+        if wide_at != 64 * b + place:
+            wide_at, wide_rings = 64 * b + place, np.int64(0)
         reason = reason_against(sums, fits, i, rules)
         step = 0
         radius_mm = points[row].radius_mm
         if reason != 0 and not rules.is_flexible and radius_limit_mm(radius_mm, rules) > radius_mm:
             step, radius_mm, n_wide, wide_rings = grow(
-                block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk, side_q,
-                points, row, block, place, own, is_exact, rules, sums, fits, i, kept, wide, n_wide, wide_rings,
+                block, bits, cell, chunk_next, chunk, side_q,
+                points, row, b, place, own, is_exact, rules, sums, fits, i, kept, wide, n_wide, wide_rings,
             )  # fmt: skip
             if step > 0:
                 reason = 0
@@ -58,16 +56,13 @@ def conclude(batch, sums, fits, n, grid, points, lines, rules, version, is_exact
         other_side = 0
         if reason == 0:
             turn_to_laser(points, row, own, laser_q, fits, i)
-            if boxed != block:
-                box_of_lasers(block_near, block_laser_q, block, laser_box_q)
-                boxed = block
+            if boxed != b:
+                box_of_lasers(block, block_laser_q, b, laser_box_q)
+                boxed = b
             if may_be_seen_from_below(points, row, fits, i, radius_mm, laser_box_q):
                 rings = rings_for(radius_mm, side_q)
                 if rings > wide_rings:
-                    n_wide = gather(
-                        block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk,
-                        block, place, rings, wide,
-                    )  # fmt: skip
+                    n_wide = gather(block, bits, cell, chunk_next, chunk, b, place, rings, wide)
                     wide_rings = rings
                 other_side = count_other_side(points, row, wide, n_wide, radius_mm, laser_q, fits, i)
         passes = not_gone_by(passes, points, row, heading, front_q, rules)
@@ -77,7 +72,7 @@ def conclude(batch, sums, fits, n, grid, points, lines, rules, version, is_exact
             changed[n_changed] = row
             n_changed += 1
         if reason != 0 or step > 0 or rules.is_flexible:
-            look_far(block_far, block, place, rings_for(reach_mm(points, row, rules), side_q))
+            look_far(bits, b, place, rings_for(reach_mm(points, row, rules), side_q))
     return n_changed
 
 

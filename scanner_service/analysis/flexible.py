@@ -93,19 +93,16 @@ def flexible_radii_mm(
 ) -> None:
     """The flexible radius of each row, put into `radii` (m,); the points keep theirs."""
     wide, squares = scratch.wide, scratch.squares
-    block_near, block_filled, block_cell = grid.block_near, grid.block_filled, grid.block_cell
-    cell_first, cell_count, chunk_next, chunk = grid.cell_first, grid.cell_count, grid.chunk_next, grid.chunk
+    block, bits, cell, chunk_next, chunk = grid.block, grid.bits, grid.cell, grid.chunk_next, grid.chunk
     rings = rings_for(rules.max_radius_mm, grid.side_q[0])
     limit = math.floor((rules.max_radius_mm * PER_MM) ** 2)
     for i in range(len(rows)):
         row = rows[i]
-        block, place = place_of(grid, points[row].x, points[row].y, points[row].z)
+        b, place = place_of(grid, points[row].x, points[row].y, points[row].z)
         radii[i] = rules.max_radius_mm
-        if block < 0:
+        if b < 0:
             continue
-        n = gather(
-            block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk, block, place, rings, wide
-        )
+        n = gather(block, bits, cell, chunk_next, chunk, b, place, rings, wide)
         found = _twentieth(points, row, wide, n, squares)
         if found <= limit:
             radii[i] = max(QUANTUM_MM * math.sqrt(found) * _REACHES, rules.uncertainty_mm)

@@ -8,7 +8,7 @@ from numba import njit
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.around import AROUND_COUNT, AROUND_MASK, AROUND_NEAR, RINGS, lowest_bit
-from scanner_service.analysis.grid import CHUNK, ROW, X, Y, Z
+from scanner_service.analysis.grid import CELL, CHUNK, COUNT, FILLED, FIRST, FRESH, NEAR, ROW, X, Y, Z
 from scanner_service.analysis.vector_copy import widen_eight
 from scanner_service.analysis.intake import QUANTUM_MM
 
@@ -45,22 +45,22 @@ def reserve_scratch(cell_limit: int) -> Scratch:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def gather(block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk, block, place, rings, buffer):
+def gather(block, bits, cell, chunk_next, chunk, b, place, rings, buffer):
     """Copy x, y, z and line of every point in the cells up to `rings` away into the buffer (4, N), and pad.
 
     Returns how many points there are.
     """
     n = np.int64(0)
     for k in range(AROUND_COUNT[rings, place]):
-        other = np.int64(block_near[block, AROUND_NEAR[rings, place, k]])
+        other = np.int64(block[b, NEAR + AROUND_NEAR[rings, place, k]])
         if other < 0:
             continue
-        mask = block_filled[other] & AROUND_MASK[rings, place, k]
+        mask = bits[other, FILLED] & AROUND_MASK[rings, place, k]
         while mask != np.uint64(0):
-            cell = np.int64(block_cell[other, lowest_bit(mask)])
+            c = np.int64(block[other, CELL + lowest_bit(mask)])
             mask &= mask - np.uint64(1)
-            here = np.int64(cell_first[cell])
-            left = np.int64(cell_count[cell])
+            here = np.int64(cell[c, FIRST])
+            left = np.int64(cell[c, COUNT])
             while True:
                 for column in range(4):  # a whole chunk at once: what is beyond its end is overwritten or padded
                     widen_eight(chunk, here, column, buffer, n)
@@ -76,32 +76,29 @@ def gather(block_near, block_filled, block_cell, cell_first, cell_count, chunk_n
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def has_fresh(block_near, block_fresh, block, place, rings):
+def has_fresh(block, bits, b, place, rings):
     """True when a cell up to `rings` away is fresh."""
     for k in range(AROUND_COUNT[rings, place]):
-        other = np.int64(block_near[block, AROUND_NEAR[rings, place, k]])
-        if other >= 0 and block_fresh[other] & AROUND_MASK[rings, place, k] != np.uint64(0):
+        other = np.int64(block[b, NEAR + AROUND_NEAR[rings, place, k]])
+        if other >= 0 and bits[other, FRESH] & AROUND_MASK[rings, place, k] != np.uint64(0):
             return True
     return False
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def gather_fresh(
-    block_near, block_fresh, block_cell, cell_first, cell_count, chunk_next, chunk,
-    block, place, rings, first_new, fresh,
-):  # fmt: skip
+def gather_fresh(block, bits, cell, chunk_next, chunk, b, place, rings, first_new, fresh):
     """Copy the coordinates of the new points in the fresh cells up to `rings` away, and pad, as `gather` does."""
     n = np.int64(0)
     for k in range(AROUND_COUNT[rings, place]):
-        other = np.int64(block_near[block, AROUND_NEAR[rings, place, k]])
+        other = np.int64(block[b, NEAR + AROUND_NEAR[rings, place, k]])
         if other < 0:
             continue
-        mask = block_fresh[other] & AROUND_MASK[rings, place, k]
+        mask = bits[other, FRESH] & AROUND_MASK[rings, place, k]
         while mask != np.uint64(0):
-            cell = np.int64(block_cell[other, lowest_bit(mask)])
+            c = np.int64(block[other, CELL + lowest_bit(mask)])
             mask &= mask - np.uint64(1)
-            here = np.int64(cell_first[cell])
-            left = np.int64(cell_count[cell])
+            here = np.int64(cell[c, FIRST])
+            left = np.int64(cell[c, COUNT])
             while left > 0:
                 for at in range(min(left, CHUNK)):
                     if chunk[here, ROW, at] >= first_new:

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from scanner_service.analysis.gathering import gather, rings_for
+from scanner_service.analysis.grid import FAR
 from scanner_service.analysis.intake import PER_MM
 from scanner_service.analysis.judging import reason_against
 from scanner_service.analysis.kernel_rules import radius_limit_mm
@@ -29,16 +30,16 @@ def reach_mm(points, row, rules):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def look_far(block_far, block, place, rings):
+def look_far(bits, b, place, rings):
     """Note that a point of a cell looks `rings` cells far."""
     for k in range(rings - 1):
-        block_far[block, k] |= np.uint64(1) << np.uint64(place)
+        bits[b, FAR + k] |= np.uint64(1) << np.uint64(place)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def grow(
-    block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk, side_q,
-    points, row, block, place, own, is_exact, rules, sums, fits, i, kept, wide, n_wide, wide_rings,
+    block, bits, cell, chunk_next, chunk, side_q,
+    points, row, b, place, own, is_exact, rules, sums, fits, i, kept, wide, n_wide, wide_rings,
 ):  # fmt: skip
     """Grow the radius to the first step that makes the point reliable, leaving its sums and fit in column i.
 
@@ -58,10 +59,7 @@ def grow(
         radius_mm = min(base_mm * _STEPS[step], limit_mm)
         rings = rings_for(radius_mm, side_q)
         if rings > wide_rings:
-            n_wide = gather(
-                block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk,
-                block, place, rings, wide,
-            )  # fmt: skip
+            n_wide = gather(block, bits, cell, chunk_next, chunk, b, place, rings, wide)
             wide_rings = rings
         reach = math.floor((radius_mm * PER_MM) ** 2)
         put(sums, i, sums_within(points, row, own, wide, n_wide, reach, is_exact))

@@ -21,6 +21,7 @@ from scanner_service.analysis.flexible import flexible_radii_mm
 from scanner_service.analysis.gathering import reserve_scratch
 from scanner_service.analysis.global_radius import GlobalRadius
 from scanner_service.analysis.grid import (
+    BLOCKS,
     blocks_to_evaluate,
     cell_side_q,
     count_points,
@@ -246,7 +247,7 @@ class LiveMap:
                 f"the live map is configured for {self.settings.max_points} points and holds {self._used}: "
                 f"{more} more do not fit; raise max_points or start another session"
             )
-        if self._grid_rows and int(self._grid.blocks_used[0]) + more > len(self._grid.block_key):
+        if self._grid_rows and int(self._grid.used[BLOCKS]) + more > len(self._grid.block):
             raise MapFull(
                 "the live map has no room for another line: the points are scattered too widely for "
                 f"{self.settings.max_points} max_points; raise it or start another session"

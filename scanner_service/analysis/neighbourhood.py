@@ -9,7 +9,7 @@ from scanner_service.analysis.around import lowest_bit
 from scanner_service.analysis.concluding import BATCH, conclude
 from scanner_service.analysis.flexible import choose_flexible_radius
 from scanner_service.analysis.gathering import Scratch, gather, gather_fresh, has_fresh, is_reached, rings_for
-from scanner_service.analysis.grid import CHUNK, LINE, ROW, X, Y, Z, Grid
+from scanner_service.analysis.grid import CELL, CHUNK, COUNT, FAR, FILLED, FIRST, LINE, ROW, Grid, X, Y, Z
 from scanner_service.analysis.growing import look_far, reach_mm
 from scanner_service.analysis.intake import PER_MM
 from scanner_service.analysis.kernel_rules import Lines, Rules
@@ -39,42 +39,38 @@ def evaluate_blocks(
 
     The sums are exact integers of offsets from the point itself, so the answer depends on the set of points alone.
     """
-    block_near, block_cell, block_far = grid.block_near, grid.block_cell, grid.block_far
-    block_filled, block_fresh = grid.block_filled, grid.block_fresh
-    cell_first, cell_count = grid.cell_first, grid.cell_count
-    chunk_next, chunk = grid.chunk_next, grid.chunk
-    pass_bit, open_bits = lines.pass_bit, np.uint8(lines.open_bits[0])
-    side_q = grid.side_q[0]
+    block, bits, block_laser_q, side_q = grid.block, grid.bits, grid.block_laser_q, grid.side_q[0]
+    cell, chunk_next, chunk = grid.cell, grid.chunk_next, grid.chunk
+    laser_q, pass_bit, open_bits = lines.laser_q, lines.pass_bit, np.uint8(lines.open_bits[0])
+    heading, front_q, waits = lines.heading, lines.front_q, lines.waits
     is_exact = side_q < EXACT_SIDE_Q and len(pass_bit) < EXACT_LINES
-    near, wide, fresh, squares = scratch.near, scratch.wide, scratch.fresh, scratch.squares
+    near, wide, fresh = scratch.near, scratch.wide, scratch.fresh
+    squares, kept = scratch.squares, scratch.kept
     far_rings = rings_for(rules.max_radius_mm, side_q)
     batch = np.empty((5, BATCH), dtype=np.int64)
     sums = np.empty((13, BATCH))
     fits = np.empty((8, BATCH))
     n_batch, n_changed = 0, 0
     for i in range(len(blocks)):
-        block = np.int64(blocks[i])
-        cells = block_filled[block]
-        while cells != np.uint64(0):
-            place = lowest_bit(cells)
-            cells &= cells - np.uint64(1)
+        b = np.int64(blocks[i])
+        places = bits[b, FILLED]
+        while places != np.uint64(0):
+            place = lowest_bit(places)
+            places &= places - np.uint64(1)
             rings = 1
             for k in range(3):
-                rings += np.int64((block_far[block, k] >> np.uint64(place)) & np.uint64(1))
-            if not has_fresh(block_near, block_fresh, block, place, rings):
+                rings += np.int64((bits[b, FAR + k] >> np.uint64(place)) & np.uint64(1))
+            if not has_fresh(block, bits, b, place, rings):
                 continue
-            cell = np.int64(block_cell[block, place])
-            here = np.int64(cell_first[cell])
+            c = np.int64(block[b, CELL + place])
+            here = np.int64(cell[c, FIRST])
             n_fresh = np.int64(0)
             if chunk[here, ROW, 0] < first_new:  # rows of a cell ascend: its first is its oldest
-                n_fresh = gather_fresh(
-                    block_near, block_fresh, block_cell, cell_first, cell_count, chunk_next, chunk,
-                    block, place, rings, first_new, fresh,
-                )  # fmt: skip
+                n_fresh = gather_fresh(block, bits, cell, chunk_next, chunk, b, place, rings, first_new, fresh)
             for k in range(3):
-                block_far[block, k] &= ~(np.uint64(1) << np.uint64(place))
+                bits[b, FAR + k] &= ~(np.uint64(1) << np.uint64(place))
             n, n_wide = np.int64(-1), np.int64(-1)
-            left = np.int64(cell_count[cell])
+            left = np.int64(cell[c, COUNT])
             while left > 0:
                 for at in range(min(left, CHUNK)):
                     row = np.int64(chunk[here, ROW, at])
@@ -83,21 +79,15 @@ def evaluate_blocks(
                         reach = math.floor((old_mm * PER_MM) ** 2)
                         x, y, z = float(chunk[here, X, at]), float(chunk[here, Y, at]), float(chunk[here, Z, at])
                         if not is_reached(x, y, z, reach, fresh, n_fresh):
-                            look_far(block_far, block, place, rings_for(old_mm, side_q))
+                            look_far(bits, b, place, rings_for(old_mm, side_q))
                             continue
                     if n < 0:
-                        n = gather(
-                            block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk,
-                            block, place, 1, near,
-                        )  # fmt: skip
+                        n = gather(block, bits, cell, chunk_next, chunk, b, place, 1, near)
                     own = np.int64(chunk[here, LINE, at])
                     if rules.is_flexible and not choose_flexible_radius(
                         points, row, near, n, wide, n_wide, squares, side_q, rules
                     ):
-                        n_wide = gather(
-                            block_near, block_filled, block_cell, cell_first, cell_count, chunk_next, chunk,
-                            block, place, far_rings, wide,
-                        )  # fmt: skip
+                        n_wide = gather(block, bits, cell, chunk_next, chunk, b, place, far_rings, wide)
                         choose_flexible_radius(points, row, near, n, wide, n_wide, squares, side_q, rules)
                     radius_q = points[row].radius_mm * PER_MM
                     reach = math.floor(radius_q**2)
@@ -112,14 +102,20 @@ def evaluate_blocks(
                             passes = passes_in_reach(points, row, passes, near, n, reach, pass_bit)
                         else:
                             passes = passes_in_reach(points, row, passes, wide, n_wide, reach, pass_bit)
-                    batch[0, n_batch], batch[1, n_batch], batch[2, n_batch] = row, block, place
+                    batch[0, n_batch], batch[1, n_batch], batch[2, n_batch] = row, b, place
                     batch[3, n_batch], batch[4, n_batch] = own, passes
                     n_batch += 1
                     if n_batch == BATCH:
                         n_changed = conclude(
-                            batch, sums, fits, n_batch, grid, points, lines, rules, version, is_exact, scratch, changed, n_changed
-                        )
+                            batch, sums, fits, n_batch, block, bits, block_laser_q, cell, chunk_next, chunk, side_q,
+                            points, laser_q, pass_bit, open_bits, heading, front_q, waits, rules, version, is_exact,
+                            wide, kept, changed, n_changed,
+                        )  # fmt: skip
                         n_batch = 0
                 left -= CHUNK
                 here = np.int64(chunk_next[here])
-    return conclude(batch, sums, fits, n_batch, grid, points, lines, rules, version, is_exact, scratch, changed, n_changed)
+    return conclude(
+        batch, sums, fits, n_batch, block, bits, block_laser_q, cell, chunk_next, chunk, side_q,
+        points, laser_q, pass_bit, open_bits, heading, front_q, waits, rules, version, is_exact,
+        wide, kept, changed, n_changed,
+    )  # fmt: skip

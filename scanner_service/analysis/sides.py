@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
+from scanner_service.analysis.grid import NEAR
 from scanner_service.analysis.intake import QUANTUM_MM
 
 
@@ -17,11 +18,11 @@ def turn_to_laser(points, row, own, laser_q, fits, i):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def box_of_lasers(block_near, block_laser_q, block, box_q):
+def box_of_lasers(block, block_laser_q, b, box_q):
     """The box of the lasers that any point within RINGS cells of a block was seen from, put into `box_q` (2, 3)."""
-    box_q[:] = block_laser_q[block]
+    box_q[:] = block_laser_q[b]
     for near in range(27):
-        other = np.int64(block_near[block, near])
+        other = np.int64(block[b, NEAR + near])
         if other >= 0:
             for axis in range(3):
                 box_q[0, axis] = min(box_q[0, axis], block_laser_q[other, 0, axis])
