@@ -8,7 +8,7 @@ from numba import njit
 from scanner_service.analysis.gathering import gather, rings_for
 from scanner_service.analysis.growing import grow, look_far, reach_mm
 from scanner_service.analysis.intake import PER_MM, QUANTUM_MM
-from scanner_service.analysis.judging import reason_against
+from scanner_service.analysis.judging import judge, reason_against
 from scanner_service.analysis.kernel_rules import radius_limit_mm
 from scanner_service.analysis.plane import fit_column, fit_planes
 from scanner_service.analysis.settling import not_gone_by, passes_in_reach
@@ -32,15 +32,18 @@ def conclude(
     n_wide, wide_rings, wide_at = np.int64(0), np.int64(0), np.int64(-1)
     laser_box_q = np.empty((2, 3))
     boxed = np.int64(-1)
+    reasons = np.empty(BATCH, dtype=np.int64)
     fit_planes(sums, n, fits)
+    judge(sums, fits, n, rules, reasons)
     for i in range(n):
         row, b, place, own = batch[0, i], batch[1, i], batch[2, i], batch[3, i]
         passes = np.uint8(batch[4, i])
+        reason = reasons[i]
         if fits[6, i] == 0.0:
             fit_column(sums, fits, i)
+            reason = reason_against(sums, fits, i, rules)
         if wide_at != 64 * b + place:
             wide_at, wide_rings = 64 * b + place, np.int64(0)
-        reason = reason_against(sums, fits, i, rules)
         step = 0
         radius_mm = points[row].radius_mm
         if reason != 0 and not rules.is_flexible and radius_limit_mm(radius_mm, rules) > radius_mm:

@@ -8,7 +8,7 @@ from numba import njit
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.around import AROUND_COUNT, AROUND_MASK, AROUND_NEAR, RINGS, lowest_bit
-from scanner_service.analysis.grid import CELL, CHUNK, COUNT, FILLED, FIRST, FRESH, NEAR, ROW, X, Y, Z
+from scanner_service.analysis.grid import CELL, CHUNK, COUNT, FILLED, FIRST, FRESH, NEAR, OLD, X, Y, Z
 from scanner_service.analysis.vector_copy import widen_eight
 from scanner_service.analysis.intake import QUANTUM_MM
 
@@ -16,6 +16,7 @@ VECTOR = 16
 """The candidates are padded to a multiple of this, so that vector registers run full."""
 
 _FAR = 1e15
+_PAGE = 512  # numbers in a page of memory
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -40,8 +41,21 @@ class Scratch(NamedTuple):
 
 def reserve_scratch(cell_limit: int) -> Scratch:
     """Buffers for cells of at most `cell_limit` points."""
-    around, far = 27 * cell_limit + 2 * VECTOR, (2 * RINGS + 1) ** 3 * cell_limit + 2 * VECTOR
-    return Scratch(np.empty((4, around)), np.empty((4, far)), np.empty((4, far)), np.empty(far), np.empty(21))
+    around, far = 27 * cell_limit, (2 * RINGS + 1) ** 3 * cell_limit
+    return Scratch(_rows(4, around), _rows(4, far), _rows(4, far), _rows(1, far)[0], np.empty(21))
+
+
+def _rows(count: int, length: int) -> Float64Array:
+    """(count, N) with room for `length` and padding in each row, so placed that vector registers load without a split.
+
+    Rows begin at cache lines, and at different places within a page: the processor takes addresses that differ by
+    whole pages for the same when it looks for what was just written.
+    """
+    stride = -(-(length + 2 * VECTOR) // _PAGE) * _PAGE + _PAGE // 4 + 8
+    room = np.empty(count * stride + 8)
+    skipped = (-room.ctypes.data % 64) // 8
+    rows: Float64Array = room[skipped : skipped + count * stride].reshape(count, stride)
+    return rows
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
@@ -85,9 +99,9 @@ def has_fresh(block, bits, b, place, rings):
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def gather_fresh(block, bits, cell, chunk_next, chunk, b, place, rings, first_new, fresh):
-    """Copy the coordinates of the new points in the fresh cells up to `rings` away, and pad, as `gather` does."""
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def gather_fresh(block, bits, cell, chunk_next, chunk, b, place, rings, fresh):
+    """Copy the coordinates of what is new in the fresh cells up to `rings` away, and pad, as `gather` does."""
     n = np.int64(0)
     for k in range(AROUND_COUNT[rings, place]):
         other = np.int64(block[b, NEAR + AROUND_NEAR[rings, place, k]])
@@ -97,23 +111,26 @@ def gather_fresh(block, bits, cell, chunk_next, chunk, b, place, rings, first_ne
         while mask != np.uint64(0):
             c = np.int64(block[other, CELL + lowest_bit(mask)])
             mask &= mask - np.uint64(1)
+            at, end = np.int64(cell[c, OLD]), np.int64(cell[c, COUNT])
             here = np.int64(cell[c, FIRST])
-            left = np.int64(cell[c, COUNT])
-            while left > 0:
-                for at in range(min(left, CHUNK)):
-                    if chunk[here, ROW, at] >= first_new:
-                        fresh[0, n] = chunk[here, X, at]
-                        fresh[1, n] = chunk[here, Y, at]
-                        fresh[2, n] = chunk[here, Z, at]
-                        n += 1
-                left -= CHUNK
+            while at >= CHUNK:
                 here = np.int64(chunk_next[here])
+                at -= CHUNK
+                end -= CHUNK
+            while at < end:
+                fresh[0, n], fresh[1, n], fresh[2, n] = chunk[here, X, at], chunk[here, Y, at], chunk[here, Z, at]
+                n += 1
+                at += 1
+                if at == CHUNK:
+                    here = np.int64(chunk_next[here])
+                    at = np.int64(0)
+                    end -= CHUNK
     for at in range(VECTOR):
         fresh[0, n + at], fresh[1, n + at], fresh[2, n + at] = _FAR, 0.0, 0.0
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "nnan"})
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={"reassoc", "nsz", "nnan"})
 def is_reached(x, y, z, reach, fresh, n_fresh):
     """True when one of the new points lies within a squared distance of (x, y, z)."""
     reached = 0.0

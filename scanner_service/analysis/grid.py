@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from scanner_service.analysis.around import BLOCK_CELLS, lowest_bit
+from scanner_service.analysis.around import AROUND_COUNT, AROUND_MASK, AROUND_NEAR, BLOCK_CELLS, lowest_bit
 from scanner_service.analysis.points import PointArray
 from scanner_service.analysis.snapshot import Int32Array, UInt8Array
 
@@ -27,9 +27,10 @@ class Grid(NamedTuple):
     `used` (5,) counts blocks, cells, chunks, blocks listed in `fresh`, and evaluations. `hash_block` (2^k,) holds block
     + 1 or 0. `block` (B, 96) holds the 27 blocks around (NEAR), the cells of the 64 places (CELL), three block
     coordinates (KEY) and the evaluation for which the block was last listed (ROUND). `bits` (B, 8) has a bit a place:
-    FILLED, it holds points; FRESH, it got or lost one since the last evaluation; FAR, FAR + 1, FAR + 2, a point of it
-    looks at least 2, 3 or 4 cells far. `block_laser_q` (B, 2, 3) is the box of the lasers that saw the block's points.
-    `fresh` (B,) lists the blocks with fresh cells. `cell` (C, 3) holds first and last chunk and the number of points.
+    FILLED, it holds points; FRESH, it got or lost one since the last evaluation; NEXT_TO, it or a cell next to it is
+    fresh, while that is evaluated; FAR, FAR + 1, FAR + 2, a point of it looks at least 2, 3 or 4 cells far. `block_laser_q` (B, 2, 3) is the box of the lasers that saw the block's points.
+    `fresh` (B,) lists the blocks with fresh cells. `cell` (C, 4) holds first and last chunk, the number of points
+    and, in a fresh cell, how many of them are older than the last evaluation.
     `chunk` (K, 5, CHUNK) holds x, y, z, scanline and point row, rows ascending along a cell, and `chunk_next` (K,) the
     chunk behind.
     """
@@ -48,8 +49,8 @@ class Grid(NamedTuple):
 
 BLOCKS, CELLS, CHUNKS, FRESH_BLOCKS, EVALUATIONS = range(5)
 NEAR, CELL, KEY, ROUND = 0, 27, 91, 94
-FILLED, FRESH, FAR = 0, 1, 2
-FIRST, LAST, COUNT = range(3)
+FILLED, FRESH, NEXT_TO, FAR = range(4)
+FIRST, LAST, COUNT, OLD = range(4)
 
 
 def cell_side_q(radius_mm: float, quantum_mm: float) -> int:
@@ -68,7 +69,7 @@ def reserve_grid(side_q: int, max_points: int) -> Grid:
         bits=np.empty((blocks, 8), dtype=np.uint64),
         block_laser_q=np.empty((blocks, 2, 3), dtype=np.float64),
         fresh=np.empty(blocks, dtype=np.int32),
-        cell=np.empty((max_points, 3), dtype=np.int32),
+        cell=np.empty((max_points, 4), dtype=np.int32),
         chunk_next=np.empty(max_points, dtype=np.int32),
         chunk=np.empty((max_points, 5, CHUNK), dtype=np.int32),
     )
@@ -165,7 +166,11 @@ def insert_points(
         x, y, z = math.floor(px * per_side), math.floor(py * per_side), math.floor(pz * per_side)
         if c < 0 or x != ax or y != ay or z != az:
             if b < 0 or x >> 2 != ax >> 2 or y >> 2 != ay >> 2 or z >> 2 != az >> 2:
-                b = _block_at(hash_block, used, block, bits, block_laser_q, x >> 2, y >> 2, z >> 2)
+                near = _near_of((x >> 2) - (ax >> 2), (y >> 2) - (ay >> 2), (z >> 2) - (az >> 2))
+                known = np.int64(block[b, NEAR + near]) if b >= 0 and near >= 0 else np.int64(-1)
+                b = known
+                if b < 0:
+                    b = _block_at(hash_block, used, block, bits, block_laser_q, x >> 2, y >> 2, z >> 2)
                 if b < 0:
                     return i
                 _stretch(block_laser_q, b, lx, ly, lz)
@@ -177,8 +182,9 @@ def insert_points(
                     return i
                 used[CELLS] = c + 1
                 block[b, CELL + place] = c
-                cell[c, FIRST], cell[c, LAST], cell[c, COUNT] = -1, -1, 0
-            _mark_fresh(bits, fresh, used, b, place)
+                cell[c, FIRST], cell[c, LAST], cell[c, COUNT], cell[c, OLD] = -1, -1, 0, 0
+            if _mark_fresh(bits, fresh, used, b, place):
+                cell[c, OLD] = cell[c, COUNT]
             bits[b, FILLED] |= np.uint64(1) << np.uint64(place)
             ax, ay, az = x, y, z
         count = np.int64(cell[c, COUNT])
@@ -213,6 +219,14 @@ def insert_points(
 
 
 @njit(cache=True, nogil=True)
+def _near_of(dx, dy, dz):
+    """Number of the neighbouring block at this offset, -1 when it is no neighbour."""
+    if abs(dx) > 1 or abs(dy) > 1 or abs(dz) > 1:
+        return -1
+    return 9 * (dx + 1) + 3 * (dy + 1) + dz + 1
+
+
+@njit(cache=True, nogil=True)
 def _stretch(block_laser_q, block, x, y, z):
     """Widen the box of a block's lasers."""
     block_laser_q[block, 0, 0], block_laser_q[block, 1, 0] = (
@@ -228,11 +242,16 @@ def _stretch(block_laser_q, block, x, y, z):
 
 @njit(cache=True, nogil=True)
 def _mark_fresh(bits, fresh, used, b, place):
-    """Note that something changed in a cell."""
-    if bits[b, FRESH] == 0:
+    """Note that something changed in a cell; False when that was known."""
+    before = bits[b, FRESH]
+    bit = np.uint64(1) << np.uint64(place)
+    if before & bit != np.uint64(0):
+        return False
+    if before == np.uint64(0):
         fresh[used[FRESH_BLOCKS]] = b
         used[FRESH_BLOCKS] += 1
-    bits[b, FRESH] |= np.uint64(1) << np.uint64(place)
+    bits[b, FRESH] = before | bit
+    return True
 
 
 @njit(cache=True, nogil=True)
@@ -287,18 +306,32 @@ def mark_all_fresh(grid: Grid) -> None:
 
 @njit(cache=True, nogil=True)
 def blocks_to_evaluate(grid: Grid) -> Int32Array:
-    """The blocks that hold fresh cells or lie next to one that does."""
-    used, block, fresh = grid.used, grid.block, grid.fresh
+    """The blocks with cells that something fresh may have reached, and in their NEXT_TO bits which cells these are.
+
+    Cells that look farther are found by whoever evaluates the block; a block that has such is listed when it lies next
+    to a fresh one.
+    """
+    used, block, bits, fresh = grid.used, grid.block, grid.bits, grid.fresh
     used[EVALUATIONS] += 1
     listed = np.empty(min(27 * used[FRESH_BLOCKS], used[BLOCKS]), dtype=np.int32)
     n = 0
     for i in range(used[FRESH_BLOCKS]):
+        b = np.int64(fresh[i])
+        places = bits[b, FRESH]
+        while places != np.uint64(0):
+            place = lowest_bit(places)
+            places &= places - np.uint64(1)
+            for k in range(AROUND_COUNT[1, place]):
+                other = np.int64(block[b, NEAR + AROUND_NEAR[1, place, k]])
+                if other >= 0:
+                    bits[other, NEXT_TO] |= AROUND_MASK[1, place, k]
         for near in range(27):
-            b = np.int64(block[fresh[i], NEAR + near])
-            if b >= 0 and block[b, ROUND] != used[EVALUATIONS]:
-                block[b, ROUND] = used[EVALUATIONS]
-                listed[n] = b
-                n += 1
+            other = np.int64(block[b, NEAR + near])
+            if other >= 0 and block[other, ROUND] != used[EVALUATIONS]:
+                if bits[other, NEXT_TO] | bits[other, FAR] != np.uint64(0):
+                    block[other, ROUND] = used[EVALUATIONS]
+                    listed[n] = other
+                    n += 1
     return listed[:n]
 
 

@@ -9,7 +9,7 @@ from scanner_service.analysis.around import lowest_bit
 from scanner_service.analysis.concluding import BATCH, conclude
 from scanner_service.analysis.flexible import choose_flexible_radius
 from scanner_service.analysis.gathering import Scratch, gather, gather_fresh, has_fresh, is_reached, rings_for
-from scanner_service.analysis.grid import CELL, CHUNK, COUNT, FAR, FILLED, FIRST, LINE, ROW, Grid, X, Y, Z
+from scanner_service.analysis.grid import CELL, CHUNK, COUNT, FAR, FILLED, FIRST, LINE, NEXT_TO, ROW, Grid, X, Y, Z
 from scanner_service.analysis.growing import look_far, reach_mm
 from scanner_service.analysis.intake import PER_MM
 from scanner_service.analysis.kernel_rules import Lines, Rules
@@ -53,22 +53,26 @@ def evaluate_blocks(
     n_batch, n_changed = 0, 0
     for i in range(len(blocks)):
         b = np.int64(blocks[i])
-        places = bits[b, FILLED]
+        places = bits[b, FILLED] & (bits[b, NEXT_TO] | bits[b, FAR])
+        next_to = bits[b, NEXT_TO]
+        bits[b, NEXT_TO] = 0
         while places != np.uint64(0):
             place = lowest_bit(places)
             places &= places - np.uint64(1)
             rings = 1
             for k in range(3):
                 rings += np.int64((bits[b, FAR + k] >> np.uint64(place)) & np.uint64(1))
-            if not has_fresh(block, bits, b, place, rings):
+            bit = np.uint64(1) << np.uint64(place)
+            if next_to & bit == np.uint64(0) and not has_fresh(block, bits, b, place, rings):
                 continue
             c = np.int64(block[b, CELL + place])
             here = np.int64(cell[c, FIRST])
             n_fresh = np.int64(0)
             if chunk[here, ROW, 0] < first_new:  # rows of a cell ascend: its first is its oldest
-                n_fresh = gather_fresh(block, bits, cell, chunk_next, chunk, b, place, rings, first_new, fresh)
-            for k in range(3):
-                bits[b, FAR + k] &= ~(np.uint64(1) << np.uint64(place))
+                n_fresh = gather_fresh(block, bits, cell, chunk_next, chunk, b, place, rings, fresh)
+            if rings > 1:
+                for k in range(3):
+                    bits[b, FAR + k] &= ~bit
             n, n_wide = np.int64(-1), np.int64(-1)
             left = np.int64(cell[c, COUNT])
             while left > 0:
