@@ -15,7 +15,7 @@ from scanner_service.analysis.around import AROUND_COUNT, AROUND_MASK, AROUND_NE
 from scanner_service.analysis.points import PointArray
 from scanner_service.analysis.snapshot import Int32Array, UInt8Array
 
-CHUNK = 8
+CHUNK = 6
 X, Y, Z, LINE, ROW = range(5)
 SMALLEST_SIDE_Q = 2048
 """Cells are never smaller than this, so that cell coordinates stay below 2^20."""
@@ -60,11 +60,11 @@ def cell_side_q(radius_mm: float, quantum_mm: float) -> int:
 
 def reserve_grid(side_q: int, max_points: int) -> Grid:
     """An empty grid with room for `max_points` points in cells of `side_q` quanta."""
-    blocks = max(1024, max_points // 4)
+    blocks = max(1024, max_points // 8)
     return Grid(
         side_q=np.array([side_q], dtype=np.int64),
         used=np.zeros(5, dtype=np.int64),
-        hash_block=np.zeros(1 << (2 * blocks - 1).bit_length(), dtype=np.int32),
+        hash_block=np.zeros(1 << (blocks + blocks // 2).bit_length(), dtype=np.int32),
         block=np.empty((blocks, 96), dtype=np.int32),
         bits=np.empty((blocks, 8), dtype=np.uint64),
         block_laser_q=np.empty((blocks, 2, 3), dtype=np.float64),
@@ -82,11 +82,13 @@ def reserve_grid(side_q: int, max_points: int) -> Grid:
 @njit(cache=True, nogil=True)
 def _slot(hash_block, block, bx, by, bz):
     """The place of a block in the hash table: its own, or the empty one where it belongs."""
+    # Blocks near each other share a page of the table, or a scan would touch all of it at once.
     mask = len(hash_block) - 1
-    h = np.uint64(bx) * np.uint64(0x9E3779B97F4A7C15)
-    h ^= np.uint64(by) * np.uint64(0xC2B2AE3D27D4EB4F)
-    h ^= np.uint64(bz) * np.uint64(0x165667B19E3779F9)
+    h = np.uint64(bx >> 3) * np.uint64(0x9E3779B97F4A7C15)
+    h ^= np.uint64(by >> 3) * np.uint64(0xC2B2AE3D27D4EB4F)
+    h ^= np.uint64(bz >> 3) * np.uint64(0x165667B19E3779F9)
     h ^= h >> np.uint64(29)
+    h = (h << np.uint64(9)) | np.uint64(((bx & 7) << 6) | ((by & 7) << 3) | (bz & 7))
     slot = np.int64(h & np.uint64(mask))
     while True:
         b = hash_block[slot] - 1

@@ -47,10 +47,13 @@ from scanner_service.analysis.radius import RadiusSettings, line_radius, point_s
 from scanner_service.analysis.settling import drop_pass, settle_lines
 from scanner_service.analysis.snapshot import Int32Array, MapSnapshot, RadiusRule, Unreliable
 
-_SHARED_BLOCKS = 16
-"""Fewer blocks than this are evaluated by the calling thread alone."""
+_SHARED_BLOCKS = 600
+"""Fewer blocks than this, what some lines touch, are evaluated sooner by the calling thread alone."""
 
 _PARTS_A_THREAD = 8
+
+_KEPT_CHANGES = 500_000
+"""Changed rows are remembered for half as many rows as the map has, and at least this many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,7 +349,7 @@ class LiveMap:
         rows = np.concatenate(changed)
         if len(rows):
             self.version = version
-            self._changes.append(version, rows, keep_rows=2 * self._used)
+            self._changes.append(version, rows, keep_rows=max(self._used // 2, _KEPT_CHANGES))
         return rows
 
     def read_version(self) -> int:

@@ -10,7 +10,11 @@ from numba.extending import intrinsic
 
 @intrinsic
 def widen_eight(typing_context: Any, source: Any, at: Any, row: Any, target: Any, column: Any) -> Any:
-    """target[row, column : column + 8] = source[at, row, 0 : 8], from int32 (K, R, 8) to float64 (R, N), unchecked."""
+    """target[row, column + k] = source[at, row, k] for 0 <= k < 8, from int32 (K, R, .) to float64 (R, N), unchecked.
+
+    What lies behind a row of the source that is shorter than 8 is copied, too.
+    """
+
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> None:
         source_type, _, _, target_type, _ = signature.args
