@@ -6,7 +6,6 @@ import numpy as np
 
 from scanner_service.analysis.snapshot import Int32Array
 
-
 _SPARSE = 64
 """Rows that are spread wider than this many times their number are sorted instead of marked."""
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
+from scanner_service.analysis.doubles import doubles_on_other_side, tell_doubles
 from scanner_service.analysis.gathering import gather, rings_for
 from scanner_service.analysis.growing import grow, look_far, reach_mm
 from scanner_service.analysis.intake import PER_MM, QUANTUM_MM
@@ -20,10 +21,10 @@ BATCH = 64
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def conclude(
-    batch, sums, fits, n, block, bits, block_laser_q, cell, chunk_next, chunk, side_q, points,
-    laser_q, pass_bit, open_bits, heading, front_q, waits, rules, version, is_exact, wide, kept, changed, n_changed,
+    batch, sums, fits, n, block, bits, block_laser_q, cell, chunk_next, chunk, more, next_double,
+    has_doubles, side_q, points, laser_q, pass_bit, open_bits, heading, front_q, waits, rules, version,
+    is_exact, wide, kept, changed, n_changed,
 ):  # fmt: skip
-
     """Fit a batch of points, let radii grow where that is needed, store the answers; the new number of changed rows.
 
     `batch` (5, BATCH) holds row, block, place, scanline and the open passes in reach. Where, and only where, the rule's
@@ -48,7 +49,7 @@ def conclude(
         radius_mm = points[row].radius_mm
         if reason != 0 and not rules.is_flexible and radius_limit_mm(radius_mm, rules) > radius_mm:
             step, radius_mm, n_wide, wide_rings = grow(
-                block, bits, cell, chunk_next, chunk, side_q,
+                block, bits, cell, chunk_next, chunk, more, has_doubles, side_q,
                 points, row, b, place, own, is_exact, rules, sums, fits, i, kept, wide, n_wide, wide_rings,
             )  # fmt: skip
             if step > 0:
@@ -68,12 +69,33 @@ def conclude(
                     n_wide = gather(block, bits, cell, chunk_next, chunk, b, place, rings, wide)
                     wide_rings = rings
                 other_side = count_other_side(points, row, wide, n_wide, radius_mm, laser_q, fits, i)
+                if has_doubles:
+                    reach = math.floor((radius_mm * PER_MM) ** 2)
+                    other_side += doubles_on_other_side(
+                        block,
+                        bits,
+                        cell,
+                        chunk_next,
+                        chunk,
+                        more,
+                        b,
+                        place,
+                        rings,
+                        points,
+                        row,
+                        reach,
+                        laser_q,
+                        fits,
+                        i,
+                    )
         passes = not_gone_by(passes, points, row, heading, front_q, rules)
         if passes & ~waits[own]:
             waits[own] = 255
         if _store(points, row, sums, fits, i, reason, radius_mm, step, passes, other_side, version):
             changed[n_changed] = row
             n_changed += 1
+            if has_doubles:
+                n_changed = tell_doubles(points, row, next_double, changed, n_changed)
         if reason != 0 or step > 0 or rules.is_flexible:
             look_far(bits, b, place, rings_for(reach_mm(points, row, rules), side_q))
     return n_changed

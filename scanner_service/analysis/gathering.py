@@ -9,8 +9,8 @@ from numba import njit
 from drivers.scanline import Float64Array
 from scanner_service.analysis.around import AROUND_COUNT, AROUND_MASK, AROUND_NEAR, RINGS, lowest_bit
 from scanner_service.analysis.grid import CELL, CHUNK, COUNT, FILLED, FIRST, FRESH, NEAR, OLD, X, Y, Z
-from scanner_service.analysis.vector_copy import widen_eight
 from scanner_service.analysis.intake import QUANTUM_MM
+from scanner_service.analysis.vector_copy import widen_eight
 
 VECTOR = 16
 """The candidates are padded to a multiple of this, so that vector registers run full."""

@@ -24,15 +24,20 @@ SMALLEST_SIDE_Q = 2048
 class Grid(NamedTuple):
     """The grid's arrays; index -1 means none.
 
-    `used` (5,) counts blocks, cells, chunks, blocks listed in `fresh`, and evaluations. `hash_block` (2^k,) holds block
-    + 1 or 0. `block` (B, 96) holds the 27 blocks around (NEAR), the cells of the 64 places (CELL), three block
-    coordinates (KEY) and the evaluation for which the block was last listed (ROUND). `bits` (B, 8) has a bit a place:
-    FILLED, it holds points; FRESH, it got or lost one since the last evaluation; NEXT_TO, it or a cell next to it is
-    fresh, while that is evaluated; FAR, FAR + 1, FAR + 2, a point of it looks at least 2, 3 or 4 cells far. `block_laser_q` (B, 2, 3) is the box of the lasers that saw the block's points.
-    `fresh` (B,) lists the blocks with fresh cells. `cell` (C, 4) holds first and last chunk, the number of points
-    and, in a fresh cell, how many of them are older than the last evaluation.
-    `chunk` (K, 5, CHUNK) holds x, y, z, scanline and point row, rows ascending along a cell, and `chunk_next` (K,) the
-    chunk behind.
+    `used` (6,) counts blocks, cells, chunks, blocks listed in `fresh`, evaluations, and rows that share an entry.
+    `hash_block` (2^k,) holds block + 1 or 0. `block` (B, 96) holds the 27 blocks around (NEAR), the cells of the 64
+    places (CELL), three block coordinates (KEY) and the evaluation for which the block was last listed (ROUND).
+
+    `bits` (B, 8) has a bit a place: FILLED, it holds points; FRESH, it got or lost one since the last evaluation;
+    NEXT_TO, it or a cell next to it is fresh, while that is evaluated; FAR, FAR + 1, FAR + 2, a point of it looks at
+    least 2, 3 or 4 cells far; DOUBLED, an entry of it stands for several rows. `block_laser_q` (B, 2, 3) is the box of
+    the lasers that saw the block's points, and `fresh` (B,) lists the blocks with fresh cells.
+
+    `cell` (C, 4) holds first and last chunk, the number of entries and, in a fresh cell, how many of them are older
+    than the last evaluation. `chunk` (K, 5, CHUNK) holds x, y, z, scanline and point row of each entry, rows ascending
+    along a cell, and `chunk_next` (K,) the chunk behind. In crowded cells the rows of a scanline that have the same
+    coordinates share an entry: `more` (K, CHUNK) says how many rows beside its own it stands for, and `next_double`
+    (P,) leads from each row to the next of them, by row + 1, 0 at the end.
     """
 
     side_q: npt.NDArray[np.int64]
@@ -45,12 +50,18 @@ class Grid(NamedTuple):
     cell: Int32Array
     chunk_next: Int32Array
     chunk: Int32Array
+    more: Int32Array
+    next_double: Int32Array
 
 
-BLOCKS, CELLS, CHUNKS, FRESH_BLOCKS, EVALUATIONS = range(5)
+BLOCKS, CELLS, CHUNKS, FRESH_BLOCKS, EVALUATIONS, DOUBLES = range(6)
 NEAR, CELL, KEY, ROUND = 0, 27, 91, 94
-FILLED, FRESH, NEXT_TO, FAR = range(4)
+FILLED, FRESH, NEXT_TO, FAR, DOUBLED = 0, 1, 2, 3, 6
 FIRST, LAST, COUNT, OLD = range(4)
+
+
+CROWDED = 64
+"""A cell with so many entries looks for the same point before it takes another."""
 
 
 def cell_side_q(radius_mm: float, quantum_mm: float) -> int:
@@ -63,7 +74,7 @@ def reserve_grid(side_q: int, max_points: int) -> Grid:
     blocks = max(1024, max_points // 8)
     return Grid(
         side_q=np.array([side_q], dtype=np.int64),
-        used=np.zeros(5, dtype=np.int64),
+        used=np.zeros(6, dtype=np.int64),
         hash_block=np.zeros(1 << (blocks + blocks // 2).bit_length(), dtype=np.int32),
         block=np.empty((blocks, 96), dtype=np.int32),
         bits=np.empty((blocks, 8), dtype=np.uint64),
@@ -72,6 +83,8 @@ def reserve_grid(side_q: int, max_points: int) -> Grid:
         cell=np.empty((max_points, 4), dtype=np.int32),
         chunk_next=np.empty(max_points, dtype=np.int32),
         chunk=np.empty((max_points, 5, CHUNK), dtype=np.int32),
+        more=np.zeros((max_points, CHUNK), dtype=np.int32),
+        next_double=np.zeros(max_points, dtype=np.int32),
     )
 
 
@@ -146,13 +159,14 @@ def insert_points(
     line: int,
     laser_q: npt.NDArray[np.float64],
     cell_limit: int,
+    shares: bool,
     counted: UInt8Array,
 ) -> int:
     """Put the points of a line, rows first_row, first_row + 1, ..., into their cells, and mark these as fresh.
 
-    `laser_q` (3,) is the line's laser position. `counted` (k,) comes in as 1 for points to insert and 0 for points to
-    pass over, and goes out with 0 where a cell already holds `cell_limit` points. Returns how many points were taken
-    in hand; fewer than k means the grid is full.
+    `laser_q` (3,) is the line's laser position; with `shares` rows with the same coordinates may share an entry.
+    `counted` (k,) comes in as 1 for points to insert and 0 for points to pass over, and goes out with 0 where a cell
+    already holds `cell_limit` entries. Returns how many points were taken in hand; fewer than k means the grid is full.
     """
     used, hash_block, block, bits, fresh = grid.used, grid.hash_block, grid.block, grid.bits, grid.fresh
     block_laser_q, cell, chunk_next, chunk = grid.block_laser_q, grid.cell, grid.chunk_next, grid.chunk
@@ -190,6 +204,9 @@ def insert_points(
             bits[b, FILLED] |= np.uint64(1) << np.uint64(place)
             ax, ay, az = x, y, z
         count = np.int64(cell[c, COUNT])
+        if count >= CROWDED and shares and _share(grid, points, c, row):
+            bits[b, DOUBLED] |= np.uint64(1) << np.uint64(place)
+            continue
         if count >= cell_limit:
             counted[i] = 0
             continue
@@ -218,6 +235,27 @@ def insert_points(
         chunk[last, ROW, at] = row
         cell[c, COUNT] = count + 1
     return len(counted)
+
+
+@njit(cache=True, nogil=True)
+def _share(grid, points, c, row):
+    """Let a row share the entry of a cell with the same coordinates, scanline and radius; False when there is none."""
+    chunk, cell = grid.chunk, grid.cell
+    here, left = np.int64(cell[c, FIRST]), np.int64(cell[c, COUNT])
+    x, y, z, line = points[row].x, points[row].y, points[row].z, points[row].line
+    while left > 0:
+        for at in range(min(left, CHUNK)):
+            if chunk[here, X, at] == x and chunk[here, Y, at] == y and chunk[here, Z, at] == z:
+                other = chunk[here, ROW, at]
+                if chunk[here, LINE, at] == line and points[other].radius_mm == points[row].radius_mm:
+                    grid.more[here, at] += 1
+                    grid.next_double[row] = grid.next_double[other]
+                    grid.next_double[other] = row + 1
+                    grid.used[DOUBLES] += 1
+                    return True
+        left -= CHUNK
+        here = np.int64(grid.chunk_next[here])
+    return False
 
 
 @njit(cache=True, nogil=True)
@@ -258,8 +296,11 @@ def _mark_fresh(bits, fresh, used, b, place):
 
 @njit(cache=True, nogil=True)
 def remove_points(grid: Grid, points: PointArray, rows: Int32Array) -> int:
-    """Take points out of their cells and mark these as fresh; returns how many were found there."""
-    bits, cell, chunk_next, chunk = grid.bits, grid.cell, grid.chunk_next, grid.chunk
+    """Take points out of their cells and mark these as fresh; returns how many were found there.
+
+    Rows that share an entry are of one scanline and go together.
+    """
+    bits, cell, chunk_next, chunk, more = grid.bits, grid.cell, grid.chunk_next, grid.chunk, grid.more
     removed = 0
     for row in rows:
         b, place = place_of(grid, points[row].x, points[row].y, points[row].z)
@@ -275,8 +316,11 @@ def remove_points(grid: Grid, points: PointArray, rows: Int32Array) -> int:
                 if found:
                     for column in range(5):
                         chunk[to_chunk, column, to_at] = chunk[here, column, at]
+                    more[to_chunk, to_at] = more[here, at]
                 elif chunk[here, ROW, at] == row:
                     found = True
+                    removed += 1 + more[here, at]
+                    grid.used[DOUBLES] -= more[here, at]
                 if found:
                     to_chunk, to_at = here, at
             left -= CHUNK
@@ -285,7 +329,7 @@ def remove_points(grid: Grid, points: PointArray, rows: Int32Array) -> int:
             here = np.int64(chunk_next[here])
         if not found:
             continue
-        removed += 1
+        more[to_chunk, to_at] = 0
         cell[c, COUNT] -= 1
         if cell[c, COUNT] % CHUNK == 0 and cell[c, COUNT] > 0:
             cell[c, LAST] = before_last
@@ -329,11 +373,12 @@ def blocks_to_evaluate(grid: Grid) -> Int32Array:
                     bits[other, NEXT_TO] |= AROUND_MASK[1, place, k]
         for near in range(27):
             other = np.int64(block[b, NEAR + near])
-            if other >= 0 and block[other, ROUND] != used[EVALUATIONS]:
-                if bits[other, NEXT_TO] | bits[other, FAR] != np.uint64(0):
-                    block[other, ROUND] = used[EVALUATIONS]
-                    listed[n] = other
-                    n += 1
+            if other < 0 or block[other, ROUND] == used[EVALUATIONS]:
+                continue
+            if bits[other, NEXT_TO] | bits[other, FAR] != np.uint64(0):
+                block[other, ROUND] = used[EVALUATIONS]
+                listed[n] = other
+                n += 1
     return listed[:n]
 
 
@@ -347,7 +392,7 @@ def forget_fresh(grid: Grid) -> None:
 
 @njit(cache=True, nogil=True)
 def count_points(blocks: Int32Array, grid: Grid) -> int:
-    """How many points the blocks hold."""
+    """How many points the blocks may hold."""
     bits, block, cell = grid.bits, grid.block, grid.cell
     count = np.int64(0)
     for b in blocks:
@@ -355,4 +400,4 @@ def count_points(blocks: Int32Array, grid: Grid) -> int:
         while places != np.uint64(0):
             count += cell[block[b, CELL + lowest_bit(places)], COUNT]
             places &= places - np.uint64(1)
-    return count
+    return count + grid.used[DOUBLES]

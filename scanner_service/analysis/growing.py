@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
+from scanner_service.analysis.doubles import add_doubles
 from scanner_service.analysis.gathering import gather, rings_for
 from scanner_service.analysis.grid import FAR
 from scanner_service.analysis.intake import PER_MM
@@ -19,7 +20,7 @@ _STEPS = np.array([GROWTH**step for step in range(32)])
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def reach_mm(points, row, rules):
-    """How far away something must stay for the point's answer to stand: its radius, after all growing that was tried."""
+    """How far away something must stay for the answer to stand: the radius, after all growing that was tried."""
     base_mm = points[row].radius_mm
     if rules.is_flexible or (points[row].growth == 0 and points[row].unreliable == 0):
         return base_mm
@@ -38,7 +39,7 @@ def look_far(bits, b, place, rings):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def grow(
-    block, bits, cell, chunk_next, chunk, side_q,
+    block, bits, cell, chunk_next, chunk, more, has_doubles, side_q,
     points, row, b, place, own, is_exact, rules, sums, fits, i, kept, wide, n_wide, wide_rings,
 ):  # fmt: skip
     """Grow the radius to the first step that makes the point reliable, leaving its sums and fit in column i.
@@ -63,6 +64,10 @@ def grow(
             wide_rings = rings
         reach = math.floor((radius_mm * PER_MM) ** 2)
         put(sums, i, sums_within(points, row, own, wide, n_wide, reach, is_exact))
+        if has_doubles:
+            add_doubles(
+                block, bits, cell, chunk_next, chunk, more, b, place, rings, points, row, own, reach, is_exact, sums, i
+            )
         fit_column(sums, fits, i)
         if reason_against(sums, fits, i, rules) == 0:
             return step, radius_mm, n_wide, wide_rings

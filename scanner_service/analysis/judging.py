@@ -31,7 +31,7 @@ def reason_against(sums, fits, i, rules):
     to_mm2 = QUANTUM_MM * QUANTUM_MM
     limit = rules.max_error_rad * rules.max_error_rad * fits[4, i]
     is_sure = (rules.noise_mm * rules.noise_mm <= limit * to_mm2) & (fits[5, i] <= limit * (total - 3.0))
-    is_plane = fits[4, i] - fits[5, i] >= MIN_GAP * fits[3, i]
+    is_plane = (fits[4, i] > 0.0) & (fits[4, i] - fits[5, i] >= MIN_GAP * fits[3, i])
     reason = 0 if is_sure & is_plane else _ILL_DETERMINED
     reason = reason if has_lines | (not rules.needs_lines) else _SINGLE_LINE
     return reason if total >= MIN_POINTS else _TOO_FEW

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.intake import QUANTUM_MM, StoredLine

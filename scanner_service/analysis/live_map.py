@@ -289,7 +289,8 @@ class LiveMap:
         counted = (said != NOT_COUNTED).astype(np.uint8)
         wanted = int(counted.sum())
         laser_q = self._lines.laser_q(line)
-        taken = insert_points(self._grid, self._points, first, line, laser_q, self.settings.cell_limit, counted)
+        shares = self.settings.radius.rule == "line"  # the others count points, and entries would be too few
+        taken = insert_points(self._grid, self._points, first, line, laser_q, self.settings.cell_limit, shares, counted)
         if taken < last - first:
             raise MapFull("the live map has no cells left: the points are scattered too widely for max_points")
         self._grid_rows = last
@@ -395,7 +396,7 @@ class LiveMap:
         return 20.0 * self.settings.radius.uncertainty_mm if limit is None else limit
 
     def _evaluate(self, blocks: Int32Array, version: int) -> list[Int32Array]:
-        """Evaluate blocks, split among the map's threads; every point belongs to one block, so none is written twice."""
+        """Evaluate blocks, split among the threads; every point belongs to one block, so none is written twice."""
         lines = self._line_state()
 
         def work(part: Int32Array) -> Int32Array:

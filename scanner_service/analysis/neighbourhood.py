@@ -7,9 +7,25 @@ from numba import njit
 
 from scanner_service.analysis.around import lowest_bit
 from scanner_service.analysis.concluding import BATCH, conclude
+from scanner_service.analysis.doubles import add_doubles
 from scanner_service.analysis.flexible import choose_flexible_radius
 from scanner_service.analysis.gathering import Scratch, gather, gather_fresh, has_fresh, is_reached, rings_for
-from scanner_service.analysis.grid import CELL, CHUNK, COUNT, FAR, FILLED, FIRST, LINE, NEXT_TO, ROW, Grid, X, Y, Z
+from scanner_service.analysis.grid import (
+    CELL,
+    CHUNK,
+    COUNT,
+    DOUBLES,
+    FAR,
+    FILLED,
+    FIRST,
+    LINE,
+    NEXT_TO,
+    ROW,
+    Grid,
+    X,
+    Y,
+    Z,
+)
 from scanner_service.analysis.growing import look_far, reach_mm
 from scanner_service.analysis.intake import PER_MM
 from scanner_service.analysis.kernel_rules import Lines, Rules
@@ -41,6 +57,7 @@ def evaluate_blocks(
     """
     block, bits, block_laser_q, side_q = grid.block, grid.bits, grid.block_laser_q, grid.side_q[0]
     cell, chunk_next, chunk = grid.cell, grid.chunk_next, grid.chunk
+    more, next_double, has_doubles = grid.more, grid.next_double, grid.used[DOUBLES] > 0
     laser_q, pass_bit, open_bits = lines.laser_q, lines.pass_bit, np.uint8(lines.open_bits[0])
     heading, front_q, waits = lines.heading, lines.front_q, lines.waits
     is_exact = side_q < EXACT_SIDE_Q and len(pass_bit) < EXACT_LINES
@@ -100,6 +117,11 @@ def evaluate_blocks(
                         put(sums, n_batch, sums_within(points, row, own, near, n, reach, is_exact))
                     else:
                         put(sums, n_batch, sums_within(points, row, own, wide, n_wide, reach, is_exact))
+                    if has_doubles:
+                        add_doubles(
+                            block, bits, cell, chunk_next, chunk, more, b, place,
+                            rings_for(points[row].radius_mm, side_q), points, row, own, reach, is_exact, sums, n_batch,
+                        )  # fmt: skip
                     passes = pass_bit[own]
                     if open_bits & ~passes:
                         if is_near:
@@ -111,15 +133,15 @@ def evaluate_blocks(
                     n_batch += 1
                     if n_batch == BATCH:
                         n_changed = conclude(
-                            batch, sums, fits, n_batch, block, bits, block_laser_q, cell, chunk_next, chunk, side_q,
-                            points, laser_q, pass_bit, open_bits, heading, front_q, waits, rules, version, is_exact,
-                            wide, kept, changed, n_changed,
+                            batch, sums, fits, n_batch, block, bits, block_laser_q, cell, chunk_next, chunk,
+                            more, next_double, has_doubles, side_q, points, laser_q, pass_bit, open_bits, heading,
+                            front_q, waits, rules, version, is_exact, wide, kept, changed, n_changed,
                         )  # fmt: skip
-                        n_batch = 0
+                        n_batch, n_wide = 0, np.int64(-1)  # the conclusion may have used the wide buffer
                 left -= CHUNK
                 here = np.int64(chunk_next[here])
     return conclude(
-        batch, sums, fits, n_batch, block, bits, block_laser_q, cell, chunk_next, chunk, side_q,
-        points, laser_q, pass_bit, open_bits, heading, front_q, waits, rules, version, is_exact,
-        wide, kept, changed, n_changed,
+        batch, sums, fits, n_batch, block, bits, block_laser_q, cell, chunk_next, chunk,
+        more, next_double, has_doubles, side_q, points, laser_q, pass_bit, open_bits, heading,
+        front_q, waits, rules, version, is_exact, wide, kept, changed, n_changed,
     )  # fmt: skip

@@ -63,9 +63,7 @@ def point_spacing_mm(xyz_q: npt.NDArray[np.int32], index: npt.NDArray[np.int32])
 
 
 @njit(cache=True, nogil=True)
-def _squared_steps(
-    xyz_q: npt.NDArray[np.int32], place: npt.NDArray[np.int32], squares: npt.NDArray[np.float64]
-) -> int:
+def _squared_steps(xyz_q: npt.NDArray[np.int32], place: npt.NDArray[np.int32], squares: npt.NDArray[np.float64]) -> int:
     """Squared distances of neighbours in quanta, exact in float64 up to 8 m; returns how many there are."""
     n = 0
     for i in range(len(place) - 1):

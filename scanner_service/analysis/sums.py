@@ -23,12 +23,18 @@ def put(sums, column, values):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def is_in_floats(count, reach, is_exact):
+    """True when the sums over so many neighbours are exact in float64; else the integers' sums are taken."""
+    return is_exact and count * reach < _EXACT
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def sums_within(points, row, own, local, n, reach, is_exact):
     """The sums of `_sums`, exact for any radius."""
     px, py, pz = points[row].x, points[row].y, points[row].z
     if is_exact:
         sums = _sums(local, n, float(px), float(py), float(pz), float(own), float(reach))
-        if sums[0] * reach < _EXACT:
+        if is_in_floats(sums[0], reach, is_exact):
             return sums
     return _sums_of_integers(local, n, px, py, pz, own, reach)
 

@@ -15,7 +15,6 @@ def widen_eight(typing_context: Any, source: Any, at: Any, row: Any, target: Any
     What lies behind a row of the source that is shorter than 8 is copied, too.
     """
 
-
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> None:
         source_type, _, _, target_type, _ = signature.args
         source_array = context.make_array(source_type)(context, builder, arguments[0])
