@@ -23,7 +23,12 @@ def agree(snapshot, rows, live):
     counted = snapshot.unreliable != Unreliable.NOT_COUNTED
     xyz_q = np.rint((snapshot.points_mm - snapshot.origin_mm) * 8192).astype(np.int64)
     oracle = Oracle(
-        xyz_q, snapshot.radius_mm, snapshot.line, snapshot.lines.laser_mm[snapshot.line], live.settings.noise_mm, counted
+        xyz_q,
+        snapshot.radius_mm,
+        snapshot.line,
+        snapshot.lines.laser_mm[snapshot.line],
+        live.settings.noise_mm,
+        counted,
     )
     for row in rows:
         answer = oracle.at(row)
@@ -62,7 +67,8 @@ def test_a_million_points_in_one_place_are_a_million_points():
     assert (snapshot.unreliable == Unreliable.ILL_DETERMINED).all()
 
 
-def test_a_crowd_that_is_withdrawn_leaves_nothing(rng=np.random.default_rng(3)):
+def test_a_crowd_that_is_withdrawn_leaves_nothing():
+    rng = np.random.default_rng(3)
     live = LiveMap(MapSettings(max_points=60_000, noise_mm=0.01))
     stays = [crowd(rng, line, places=12, copies=20) for line in range(3)]
     goes = [crowd(rng, line, places=12, copies=60, device="B") for line in range(3)]
