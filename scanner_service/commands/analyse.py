@@ -7,9 +7,10 @@ import numpy as np
 import typer
 
 from scanner_service import __version__
-from scanner_service.analysis.cloud import CloudRule, analyse_cloud
+from scanner_service.analysis.cloud import TURNED_UP, CloudRule, analyse_cloud
 from scanner_service.analysis.snapshot import Unreliable
 from scanner_service.commands.options import parse_position, parse_units
+from scanner_service.commands.orienting import orient_snapshot
 from scanner_service.commands.terminal import check_folder, console, errors, plain_errors, show_json
 from scanner_service.sessions.results import summarise_cloud
 from scanner_service.storage.exports.density_png import density_png
@@ -30,11 +31,14 @@ def analyse_command(
     max_radius: Annotated[float | None, typer.Option(help="Largest radius in mm; 2 by default.")] = None,
     seen_from: Annotated[str | None, typer.Option(help="x,y,z in mm that normals are turned to.")] = None,
     density: Annotated[float | None, typer.Option(help="Required points per mm².")] = None,
+    orient: Annotated[bool, typer.Option("--orient", help="Turn normals to the outside, and say how sure.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Analyse a cloud with a given radius or one of the chapter's rules, and write the result files."""
     with plain_errors():
         chosen = _rule(rule, radius)
+        if orient and seen_from is not None:
+            raise ValueError("--seen-from tells the side of each normal, --orient finds it: leave one of them out")
         check_folder(out)
         cloud = open_cloud(file, ReadOptions(parse_units(units)))
         position = parse_position(seen_from)
@@ -46,12 +50,16 @@ def analyse_command(
                 max_radius_mm=max_radius,
                 seen_from_mm=None if position is None else np.array(position),
             )
-        notes = (*cloud.notes, *found.notes)
+        snapshot, notes = found.snapshot, (*cloud.notes, *found.notes)
+        oriented = {}
+        if orient:
+            with errors.status("orienting normals …"):
+                snapshot, oriented["orientation"], told = orient_snapshot(snapshot, out)
+            notes = (*(note for note in notes if note != TURNED_UP), *told)
         for note in notes:
             errors.print(f"note: {note}", highlight=False, soft_wrap=True)
-        snapshot = found.snapshot
         losses = {"points": {"declared": cloud.points_declared, "dropped": dict(cloud.dropped) | found.dropped}}
-        summary = {"name": file.name} | summarise_cloud(snapshot, losses, __version__, notes)
+        summary = {"name": file.name} | summarise_cloud(snapshot, losses, __version__, notes) | oriented
         rescan = np.zeros(len(snapshot), dtype=np.bool_)
         if density is not None:
             rescan = (snapshot.density_per_mm2 < density) & (snapshot.unreliable != Unreliable.NOT_COUNTED)
@@ -69,7 +77,8 @@ def analyse_command(
             "normal" + (f"; {summary['below_required']:,} below {density:g} points/mm²" if density is not None else ""),
             highlight=False,
         )
-        console.print(f"Written to {out}: points.ply, density.png, regions.json, summary.json", highlight=False)
+        files = "points.ply, density.png, regions.json, summary.json" + (", oriented.ply" if orient else "")
+        console.print(f"Written to {out}: {files}", highlight=False)
 
 
 def _rule(rule: str | None, radius: float | None) -> CloudRule:

@@ -12,8 +12,8 @@ from drivers.scanline import Float64Array
 from scanner_service.analysis.graphs.kd_tree import Int32Array, KdTree, build_kd_tree, distance_sq
 from scanner_service.analysis.graphs.nearest import nearest_points
 
-LARGEST = 1e100
-"""Coordinates beyond are refused: their squares would not be finite."""
+LARGEST = 1e60
+"""Coordinates beyond are refused: products of their squares would not be finite."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ def find_places(points_mm: npt.ArrayLike) -> Places:
 
     Raises
     ------
-    ValueError : no points, another shape, or coordinates that are not finite (or beyond 1e100).
+    ValueError : no points, another shape, or coordinates that are not finite (or beyond 1e60).
     """
     points = check_points(points_mm)
     first = np.empty(len(points), dtype=np.int32)
