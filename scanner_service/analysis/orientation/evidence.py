@@ -29,7 +29,7 @@ class Evidence:
 def weigh_components(
     xyz: Float64Array, normals: Float32Array, area: Float64Array, component: Int32Array, count: int
 ) -> Evidence:
-    """Sums over each component of points (n, 3) with oriented unit normals (n, 3), each standing for an `area` (n,) in mm².
+    """Sums over each component of points (n, 3) with oriented unit normals (n, 3), standing for `area` (n,) mm².
 
     Of a closed surface the sum of A n vanishes, and by the divergence theorem the sum of A n·p is three times the
     volume inside, positive when normals point outwards.

@@ -137,7 +137,8 @@ def _unit(normals: Float64Array) -> Float32Array:
 class _Web:
     """The Riemannian graph: links (m, 2), what they say, which make up the minimum spanning forest of their costs.
 
-    `area` (n,) is the share of the surface that a point stands for, mm²: that of its reach over k. `group` (n,) numbers the trees.
+    `area` (n,) is the share of the surface that a point stands for, mm²: that of its reach over k. `group`
+    (n,) numbers the trees.
     """
 
     links: Int32Array

@@ -38,12 +38,12 @@ class ComponentTable:
     """The components of a cloud by falling number of points, one row each.
 
     `points` (C,) how many; `sure_points` (C,) those of the largest patch that no doubtful link holds together, less
-    the ends of links that contradict. `start_row` (C,) the point of the largest z in it. `confidence` (C,) from 0.5, a toss of a coin, to 1, nothing was guessed: 0.5 + 0.5 *
-    the share of points whose side is known. `openness` (C,) is |sum A n| / sum A, 0 for a closed surface and 1 for a
-    flat sheet; `fullness` (C,) is sum A n·(p - c) / (R sum A) with R the rms distance from the centroid c: 1 for a
-    sphere with normals outwards, -1 inwards, after orientation. `turned` (C,) True where the enclosed volume overruled
-    the start. `links`, `disagreeing` (C,) count links along the surface, and those whose ends lie on different sides.
-    `doubt` (C,) says why.
+    the ends of links that contradict. `start_row` (C,) the point of the largest z in it. `confidence` (C,) from 0.5, a
+    toss of a coin, to 1, nothing was guessed: 0.5 + 0.5 * the share of points whose side is known. `openness` (C,) is
+    |sum A n| / sum A, 0 for a closed surface and 1 for a flat sheet; `fullness` (C,) is sum A n·(p - c) / (R sum A)
+    with R the rms distance from the centroid c: 1 for a sphere with normals outwards, -1 inwards, after orientation.
+    `turned` (C,) True where the enclosed volume overruled the start. `links`, `disagreeing` (C,) count links along the
+    surface, and those whose ends lie on different sides. `doubt` (C,) says why.
     """
 
     points: npt.NDArray[np.int64]
