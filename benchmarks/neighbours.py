@@ -31,9 +31,8 @@ _NAMES = {
     "ckdtree_counts": "scipy cKDTree, counts",
     "ckdtree_lists": "scipy cKDTree, lists of neighbours",
     "open3d": "Open3D KDTreeFlann, one query a call",
-    "sklearn": "scikit-learn KDTree, counts",
 }
-_STYLES = ("o-", "s--", "^-.", "D:", "v-")
+_STYLES = ("o-", "s--", "^-.", "D:")
 
 
 def structures(points_mm: Float64Array, queries: npt.NDArray[np.int64]) -> Iterator[tuple[str, int, Count]]:
@@ -47,12 +46,7 @@ def structures(points_mm: Float64Array, queries: npt.NDArray[np.int64]) -> Itera
 
     yield "live_map", n, live_map
     yield "ckdtree_counts", len(asked), lambda r: int(tree.query_ball_point(asked, r, return_length=True).sum())
-    yield "ckdtree_lists", len(asked), lambda r: sum(map(len, tree.query_ball_point(asked, r)))
-    if is_installed("scikit-learn"):
-        from sklearn.neighbors import KDTree
-
-        other = KDTree(points_mm)
-        yield "sklearn", len(asked), lambda r: int(other.query_radius(asked, r, count_only=True).sum())
+    yield "ckdtree_lists", len(asked), lambda r: sum(len(found) for found in tree.query_ball_point(asked, r))
     if is_installed("open3d"):
         import open3d
 
@@ -67,7 +61,7 @@ def structures(points_mm: Float64Array, queries: npt.NDArray[np.int64]) -> Itera
 
 def measure(points: int, repeats: int, seed: int = 1) -> dict[str, Any]:
     """Best of `repeats` for each structure and radius; exponents are slopes of log time over log radius from r on."""
-    points_mm = coordinates_q(make_lines(points)) * QUANTUM_MM
+    points_mm = coordinates_q(make_lines(points)).astype(np.float64) * QUANTUM_MM
     rng = np.random.default_rng(seed)
     queries = rng.choice(len(points_mm), max(1, len(points_mm) // 5), replace=False)
     queries.sort()
@@ -109,11 +103,10 @@ def plot(figures: dict[str, Any], path: Path) -> None:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for style, (name, found) in zip(_STYLES, figures["structures"].items(), strict=False):
-        radius = [row["radius_mm"] for row in found["rows"]]
+        radius = np.array([row["radius_mm"] for row in found["rows"]])
         cost = [row["us_per_query"] for row in found["rows"]]
         axes.loglog(radius, cost, style, label=f"{_NAMES[name]}: grows as r^{found['exponent']:.1f}")
     rows = figures["structures"]["live_map"]["rows"]
-    radius = np.array([row["radius_mm"] for row in rows])
     axes.loglog(radius, 0.35 * (radius / radius[0]) ** 2, color="#888888", linewidth=1, label="r²")
     axes.set_xticks(radius, [f"{r:.2f}\n{row['neighbours']:.0f}" for r, row in zip(radius, rows, strict=True)])
     axes.set_xticks([], minor=True)
