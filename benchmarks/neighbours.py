@@ -44,9 +44,13 @@ def structures(points_mm: Float64Array, queries: npt.NDArray[np.int64]) -> Itera
     def live_map(radius_mm: float) -> int:
         return int(analyse_cloud(points_mm, "fixed", radius_mm=radius_mm).snapshot.neighbours.sum())
 
+    def lists(radius_mm: float) -> int:
+        found: Any = tree.query_ball_point(asked, radius_mm)
+        return sum(len(rows) for rows in found)
+
     yield "live_map", n, live_map
     yield "ckdtree_counts", len(asked), lambda r: int(tree.query_ball_point(asked, r, return_length=True).sum())
-    yield "ckdtree_lists", len(asked), lambda r: sum(len(found) for found in tree.query_ball_point(asked, r))
+    yield "ckdtree_lists", len(asked), lists
     if is_installed("open3d"):
         import open3d
 
