@@ -73,7 +73,7 @@ def orient_normals(
     if not gap_factor > 0:
         raise ValueError(f"the gap factor must be greater than 0, not {gap_factor}")
     points, given, rows, left_out = _take_part(points_mm, normals)
-    places = find_places(points[rows])
+    places = find_places(points if len(rows) == len(points) else points[rows])
     xyz, row = places.tree.xyz, rows[places.tree.row]
     unit = _unit(given[row])
     web = _weave(places, unit, neighbours, np.inf if plain else gap_factor, plain, threads)
