@@ -5,6 +5,7 @@ JSON ?= $(OUT)/live-map.json
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+WORKERS ?= 2
 
 .PHONY: demo test test-long lint bench clean
 .DELETE_ON_ERROR:
@@ -23,7 +24,7 @@ demo: $(VENV)/installed
 	$(BIN)/scanner demo --out $(OUT) $(ARGS)
 
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
 
 test-long: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m long --timeout 3600 $(ARGS)
