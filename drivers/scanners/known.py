@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from drivers.errors import DriverError, PortError, ScannerError
+from drivers.protocols import scip_host
 from drivers.scanline import DeviceInfo
 from drivers.scanners.face import FreeRunningScanner, Scanner
 from drivers.scanners.native import NativeScanner
+from drivers.scanners.scip import open_scip
 
 Opener: TypeAlias = Callable[[str, int], Scanner]
 
@@ -20,7 +22,8 @@ class KnownScanner:
     """A kind of scanner.
 
     `baud_rates` are those worth trying, the likeliest first. `opens` makes a driver for a path and a rate; nothing is
-    opened before its `enter`. `runs_free` tells a `FreeRunningScanner` from one that has a stage of its own.
+    opened before its `enter`. `runs_free` tells a `FreeRunningScanner` from one that has a stage of its own. A driver
+    that `tries_rates` begins with the given one and finds the others itself.
     """
 
     name: str
@@ -28,6 +31,7 @@ class KnownScanner:
     baud_rates: tuple[int, ...]
     opens: Opener
     runs_free: bool
+    tries_rates: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +46,10 @@ class Found:
 KNOWN: dict[str, KnownScanner] = {
     known.name: known
     for known in (
-        KnownScanner("native", "a scanner of the native protocol", (3_000_000, 921_600, 115_200), NativeScanner, False),
+        KnownScanner(
+            "native", "a scanner of the native protocol", (3_000_000, 921_600, 115_200), NativeScanner, False, False
+        ),
+        KnownScanner("scip", "Hokuyo lidar, SCIP 2.0 (URG, UBG, UHG, UTM)", scip_host.RATES, open_scip, True),
     )
 }
 
@@ -83,10 +90,12 @@ def identify(path: str, names: Iterable[str] | None = None, baud_rates: Iterable
     rates = None if baud_rates is None else tuple(baud_rates)
     for name in KNOWN if names is None else names:
         known = known_scanner(name)
-        for rate in known.baud_rates if rates is None else rates:
+        to_try = known.baud_rates if rates is None else rates
+        for rate in to_try[:1] if known.tries_rates else to_try:
             scanner = known.opens(path, rate)
             try:
-                return Found(known, rate, scanner.enter())
+                info = scanner.enter()
+                return Found(known, getattr(scanner, "baud_rate", None) or rate, info)
             except PortError:
                 raise
             except ScannerError:
