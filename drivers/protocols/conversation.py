@@ -65,6 +65,9 @@ class Conversation(ABC):
     silent_after_s = 2.0
     """A stream without a profile for so long has stopped: the link is then opened anew."""
 
+    break_after_s: float | None = None
+    """A pause inside a frame after which its rest will not come; None where a frame says itself where it ends."""
+
     def __init__(
         self,
         deliver: Callable[[Profile], bool],
@@ -86,6 +89,7 @@ class Conversation(ABC):
         """Why nobody was met on this link."""
         self.laser_on: bool | None = None
         self.heard_bytes = 0
+        self._heard_s = 0.0
         self.boot_id = boot_id
         self.pass_index = 0
         self._rates = rates
@@ -114,6 +118,10 @@ class Conversation(ABC):
     @abstractmethod
     def _reset_decoder(self) -> list[Damage]:
         """Forget what has begun; return it as damage."""
+
+    def _break_off(self) -> list[Any]:
+        """What can be understood when the rest of the frame under way will not come; the decoder may keep nothing."""
+        return []
 
     @abstractmethod
     def _greet(self) -> Script[DeviceInfo]:
@@ -198,14 +206,13 @@ class Conversation(ABC):
         self.heard_bytes += len(data)
         if self._dialogue is not None:
             self._dialogue.heard(now_s)
-        for item in self._decode(data, now_s):
-            if isinstance(item, Damage):
-                self._damage(item)
-            elif not (self._dialogue is not None and self._dialogue.offer(item, now_s)) and self._streaming:
-                self._take(item, now_s)
+        self._heard_s = now_s
+        self._hear(self._decode(data, now_s), now_s)
 
     def tick(self, now_s: float) -> None:
         """Do what is due by now."""
+        if self.break_after_s is not None and now_s - self._heard_s > self.break_after_s:
+            self._hear(self._break_off(), now_s)
         if self._dialogue is not None:
             self._dialogue.tick(now_s)
         if self.phase is not Phase.CLOSED:
@@ -336,6 +343,13 @@ class Conversation(ABC):
             self._ledger.no_return(no_return)
         else:
             self._ledger.line_not_kept("host_overflow", 1)
+
+    def _hear(self, items: list[Any], now_s: float) -> None:
+        for item in items:
+            if isinstance(item, Damage):
+                self._damage(item)
+            elif not (self._dialogue is not None and self._dialogue.offer(item, now_s)) and self._streaming:
+                self._take(item, now_s)
 
     # ---- inside ---------------------------------------------------------------------------------------------------
 

@@ -267,6 +267,7 @@ class ScipHost(Conversation):
         raise ScannerTimeout("the lidar does not acknowledge the request to measure; check power and cable")
 
     def _end(self) -> Script[None]:
+        self.laser_on = None
         for _ in range(4):
             self._say(b"QT\n")
             answer = yield Answer(_is_reply_to("QT"), 1.0)

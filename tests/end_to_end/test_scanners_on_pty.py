@@ -12,13 +12,19 @@ from drivers.protocols.scanner_events import Disconnected, PassEnded, Reconnecte
 from drivers.scanline import Profile
 from drivers.scanners.free_running import FreeRunner
 from drivers.scanners.known import KNOWN, identify, open_free_running
+from simulators.devices.lms import LmsDevice
+from simulators.devices.rplidar import A2, RplidarDevice
 from simulators.devices.scip import ScipDevice
 from simulators.pty_port import PtyPort
 from tests.end_to_end.test_driver_on_pty import open_descriptors
 from tests.unit.drivers.conversation_bench import flat_scene
 
 PATIENCE_S = 40.0
-DEVICES = {"scip": lambda: ScipDevice(flat_scene())}
+DEVICES = {
+    "scip": lambda: ScipDevice(flat_scene()),
+    "lms200": lambda: LmsDevice(flat_scene(), rng=np.random.default_rng(2)),
+    "rplidar": lambda: RplidarDevice(flat_scene(), A2),
+}
 
 
 @pytest.fixture(autouse=True)
@@ -70,15 +76,16 @@ def test_a_scanner_is_found_measures_and_is_left_with_its_laser_off(name: str) -
             catch = Catch(scanner)
             with pytest.raises(PortBusy):
                 open_free_running(name, str(port.path)).enter()
-            assert scanner.laser_on is False
+            shines_always = name == "lms200"
+            assert scanner.laser_on is shines_always
             scanner.start_profiles()
             assert scanner.laser_on is True
             catch.until(lambda: len(catch.lines) >= 5)
             scanner.stop_profiles()
-            assert scanner.laser_on is False
+            assert scanner.laser_on is shines_always
             catch.until(lambda: catch.count(PassEnded) == 1)
             tally = scanner.tally()
-        assert not port._device.laser_on
+        assert port._device.laser_on is shines_always
         assert scanner.laser_on is None
         with pytest.raises(ScannerNotConnected):
             scanner.start_profiles()
