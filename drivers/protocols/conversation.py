@@ -108,6 +108,7 @@ class Conversation(ABC):
         self._profile_s = 0.0
         self._timed_s = 0.0
         self._timed_pass = 0
+        self._in_trouble: str | None = None
 
     # ---- what a protocol brings -----------------------------------------------------------------------------------
 
@@ -150,7 +151,7 @@ class Conversation(ABC):
     def link_opened(self, now_s: float) -> None:
         """Begin to talk on a new link."""
         self.outgoing.clear()
-        self.failure = None
+        self.failure = self._in_trouble = None
         self.phase = Phase.MEETING
         self._run(self._greet(), now_s, self._met, self._unmet)
 
@@ -195,6 +196,8 @@ class Conversation(ABC):
             return f"another scanner answers, {self._other_id}"
         if self.phase is Phase.UNMET:
             return str(self.failure)
+        if self._in_trouble is not None:
+            return self._in_trouble
         if self._streaming and self._dialogue is None and now_s - self._profile_s > self.silent_after_s:
             return f"no profile has come for {self.silent_after_s:g} s; check the scanner's power and its cable"
         return None

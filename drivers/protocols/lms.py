@@ -10,7 +10,8 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from drivers.protocols.framing import Damage, DamageReason
+from drivers.protocols.framing import DamageReason
+from drivers.protocols.prefixed import PrefixedDecoder
 from drivers.scanline import BoolArray, Float64Array
 
 STX = 0x02
@@ -222,107 +223,31 @@ def first_angle_deg(angle_deg: int) -> float:
     return 90.0 - angle_deg / 2
 
 
-class TelegramDecoder:
-    """Bytes of one direction in, telegrams, ACK, NAK and damage out; keeps at most one telegram's bytes.
+class TelegramDecoder(PrefixedDecoder[Telegram | Control]):
+    """Bytes of one direction in, telegrams, ACK, NAK and damage out."""
 
-    What looks like a beginning and is none costs nothing: the search goes on at the next byte. At any time: bytes
-    received = `accepted_bytes` + bytes of damage + `pending_bytes`.
-    """
+    failed_check = DamageReason.BAD_CRC
 
     def __init__(self, *, from_host: bool = False) -> None:
-        self._buffer = bytearray()
+        super().__init__()
         self._from_host = from_host
-        self._skipped_bytes = 0
-        self._has_bad_crc = False
-        self.accepted_bytes = 0
 
-    @property
-    def pending_bytes(self) -> int:
-        """Bytes received of which nothing can be said yet."""
-        return len(self._buffer) + self._skipped_bytes
-
-    @property
-    def has_begun(self) -> bool:
-        """True while a telegram may be under way."""
-        return bool(self._buffer)
-
-    @property
-    def has_bad_check(self) -> bool:
-        """True when a telegram whose check failed is among the bytes of which nothing has been said yet."""
-        return self._has_bad_crc
-
-    def reset(self) -> int:
-        """Forget what has begun; return how many bytes that were."""
-        n_bytes = self.pending_bytes
-        self._buffer.clear()
-        self._skipped_bytes = 0
-        self._has_bad_crc = False
-        return n_bytes
-
-    def break_off(self) -> list[Telegram | Control | Damage]:
-        """The rest of what has begun will not come: search what is there for what it hides, and keep nothing."""
-        found: list[Telegram | Control | Damage] = []
-        while self._buffer:
-            self._skip()
-            found += self.receive(b"")
-        if self._skipped_bytes:
-            self._accept(0, found)
-        return found
-
-    def receive(self, data: bytes) -> list[Telegram | Control | Damage]:
-        """Take the next bytes; return what they complete."""
-        found: list[Telegram | Control | Damage] = []
-        self._buffer += data
-        while self._buffer:
-            length = self._length()
-            if length is None or len(self._buffer) < length:
-                break
-            if length == 1:
-                self._take_byte(found)
-                continue
-            whole = bytes(self._buffer[:length])
-            if crc(whole[:-2]) != int.from_bytes(whole[-2:], "little"):
-                self._has_bad_crc = True
-                self._skip()
-                continue
-            self._accept(length, found)
-            content = whole[5:-2]
-            status = None if self._from_host else content[-1]
-            found.append(Telegram(whole[1], whole[4], content if self._from_host else content[:-1], status, length))
-        return found
-
-    def _length(self) -> int | None:
-        """Bytes of the telegram that begins the buffer, 1 when none can; None while that is not known."""
-        buffer = self._buffer
-        if buffer[0] != STX:
-            return 1
-        if len(buffer) < 2:
-            return None
-        if (buffer[1] >= REPLY_BIT) == self._from_host:
-            return 1
+    def _length(self, buffer: bytearray) -> int | None:
+        if buffer[0] != STX or (len(buffer) > 1 and (buffer[1] >= REPLY_BIT) == self._from_host):
+            return 0
         if len(buffer) < 4:
             return None
         length = (buffer[2] | buffer[3] << 8) + _OVERHEAD_BYTES
         shortest = _OVERHEAD_BYTES + (1 if self._from_host else 2)
-        return length if shortest <= length <= MAX_TELEGRAM_BYTES else 1
+        return length if shortest <= length <= MAX_TELEGRAM_BYTES else 0
 
-    def _take_byte(self, found: list[Telegram | Control | Damage]) -> None:
-        byte = self._buffer[0]
-        if byte in (ACK, NAK) and not self._skipped_bytes:
-            self._accept(1, found)
-            found.append(Control(byte))
-        else:
-            self._skip()
+    def _read(self, whole: bytes) -> Telegram | None:
+        if crc(whole[:-2]) != int.from_bytes(whole[-2:], "little"):
+            return None
+        content = whole[5:-2]
+        if self._from_host:
+            return Telegram(whole[1], whole[4], content, None, len(whole))
+        return Telegram(whole[1], whole[4], content[:-1], content[-1], len(whole))
 
-    def _skip(self) -> None:
-        del self._buffer[:1]
-        self._skipped_bytes += 1
-
-    def _accept(self, n_bytes: int, found: list[Telegram | Control | Damage]) -> None:
-        if self._skipped_bytes:
-            reason = DamageReason.BAD_CRC if self._has_bad_crc else DamageReason.DEBRIS
-            found.append(Damage(reason, self._skipped_bytes))
-            self._skipped_bytes = 0
-            self._has_bad_crc = False
-        del self._buffer[:n_bytes]
-        self.accepted_bytes += n_bytes
+    def _lone(self, byte: int) -> Control | None:
+        return Control(byte) if byte in (ACK, NAK) else None

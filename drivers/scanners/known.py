@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from drivers.errors import DriverError, PortError, ScannerError
-from drivers.protocols import lms_host, rplidar_host, scip_host
+from drivers.protocols import lms_host, ls100_host, rplidar_host, scip_host
 from drivers.scanline import DeviceInfo
 from drivers.scanners.face import FreeRunningScanner, Scanner
 from drivers.scanners.lms import open_lms
+from drivers.scanners.ls100 import open_ls100
 from drivers.scanners.native import NativeScanner
 from drivers.scanners.rplidar import open_rplidar
 from drivers.scanners.scip import open_scip
@@ -54,6 +55,7 @@ KNOWN: dict[str, KnownScanner] = {
         KnownScanner("scip", "Hokuyo lidar, SCIP 2.0 (URG, UBG, UHG, UTM)", scip_host.RATES, open_scip, True),
         KnownScanner("rplidar", "Slamtec RPLIDAR (A, S and C series)", rplidar_host.RATES, open_rplidar, True),
         KnownScanner("lms200", "SICK LMS200, 211, 220, 221, 291", lms_host.RATES, open_lms, True),
+        KnownScanner("ls100", "SICK Profiler 2, Optex FASTUS LS-100", ls100_host.RATES, open_ls100, True),
     )
 }
 

@@ -105,7 +105,7 @@ class LmsDevice:
                 self._out.clear()
                 self._out += bytes([ACK])
                 self._obey(item.command, item.data, now_s)
-        if self._ear.has_bad_check:
+        if self._ear.has_failed_check:
             self._ear.reset()
             self._out += bytes([NAK])
 
