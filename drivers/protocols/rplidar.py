@@ -208,14 +208,15 @@ def read_capsule(data: bytes | bytearray, kind: int, *, signed_offsets: bool = F
 class AnswerDecoder:
     """Bytes from a lidar in, descriptors, packets, samples, capsules and damage out; keeps at most 512 bytes.
 
-    `expect` is to be called with each request: what comes is then no stream any more until a descriptor says so. At any
-    time: bytes received = `accepted_bytes` + bytes of damage + `pending_bytes`.
+    `expect` is to be called with each request: what comes is then no stream any more until a descriptor of that kind
+    says so. At any time: bytes received = `accepted_bytes` + bytes of damage + `pending_bytes`.
     """
 
     def __init__(self, *, signed_offsets: bool = False) -> None:
         self._buffer = bytearray()
         self._signed_offsets = signed_offsets
         self._expected: Descriptor | None = None
+        self._wanted_kind: int | None = None
         self._skipped_bytes = 0
         self._is_sure = True
         self.accepted_bytes = 0
@@ -225,16 +226,18 @@ class AnswerDecoder:
         """Bytes received of which nothing can be said yet."""
         return len(self._buffer) + self._skipped_bytes
 
-    def expect(self) -> None:
-        """A request was sent: the next thing to understand is a descriptor."""
+    def expect(self, kind: int) -> None:
+        """A request was sent: the next thing to understand is a descriptor of `kind`; what came before is none."""
         self._expected = None
+        self._wanted_kind = kind
+        self._skip(len(self._buffer))
 
     def reset(self) -> int:
         """Forget what has begun; return how many bytes that were."""
         n_bytes = self.pending_bytes
         self._buffer.clear()
         self._skipped_bytes = 0
-        self._expected = None
+        self._expected = self._wanted_kind = None
         return n_bytes
 
     def receive(self, data: bytes) -> list[Descriptor | Packet | Sample | Capsule | Damage]:
@@ -279,7 +282,7 @@ class AnswerDecoder:
         word, kind = struct.unpack_from("<IB", self._buffer, 2)
         length, many = word & 0x3FFFFFFF, word >> 30
         fits = (4 < length <= MAX_REPLY_BYTES) if kind == Answer.CONF else _LENGTHS.get(kind) == length
-        if not fits or many != (kind in STREAMS):
+        if not fits or many != (kind in STREAMS) or self._wanted_kind not in (None, kind):
             self._skip(1)
             return True
         self._accept(DESCRIPTOR_BYTES, found)

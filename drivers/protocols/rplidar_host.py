@@ -40,6 +40,7 @@ RATES = (115_200, 256_000, 460_800, 1_000_000)
 USUAL_PWM = 660
 _ANSWER_S = 0.3
 _QUIET_S = 0.1
+_NOTHING = -1  # what STOP and RESET are answered by
 _SPIN_UP_S = 6.0
 _MAX_MODES = 16
 _COUNTER = 1 << 48  # samples are counted by the host: the counter never wraps
@@ -176,12 +177,12 @@ class RplidarHost(Conversation):
 
     def _packet(self, question: bytes, kind: int) -> Script[bytes | None]:
         """Ask for a single answer; None when none comes."""
-        self._ask(question)
+        self._ask(question, kind)
         packet = yield Awaited(lambda item: isinstance(item, Packet) and item.kind == kind, _ANSWER_S)
         return None if packet is None else packet.data
 
-    def _ask(self, question: bytes) -> None:
-        self._decoder.expect()
+    def _ask(self, question: bytes, kind: int = _NOTHING) -> None:
+        self._decoder.expect(kind)
         self._say(question)
 
     def _health(self) -> Script[tuple[int, int] | None]:
@@ -270,7 +271,7 @@ class RplidarHost(Conversation):
             self._say(request(Command.SET_MOTOR_PWM, struct.pack("<H", self._options.motor_pwm)))
         for _ in range(2):
             self._turns.forget()
-            self._ask(mode.request)
+            self._ask(mode.request, mode.kind)
             answer = yield Awaited(lambda item: isinstance(item, Descriptor) and item.kind == mode.kind, 2.0)
             if answer is not None:
                 self.laser_on = True

@@ -114,7 +114,11 @@ def test_pyrplidar_reads_the_simulated_lidar() -> None:
     assert [mode[:2] for mode in found["modes"]] == [["Standard", 0x81], ["Express", 0x82]]
     check_samples(found["express"], 8.0)  # angles are rounded to 1/64 degree, distances to whole mm
     check_samples(found["standard"], 2.0)
-    assert [k for k, sample in enumerate(found["standard"]) if sample[0]] == [0, 197, 394]  # 508 us at 10 turns a second
+    assert [k for k, sample in enumerate(found["standard"]) if sample[0]] == [
+        0,
+        197,
+        394,
+    ]  # 508 us at 10 turns a second
     assert not device.laser_on
     assert device.motor_pwm == 0
 
