@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: demo test test-long lint bench clean
+.PHONY: demo test test-long fuzz lint bench clean
 .DELETE_ON_ERROR:
 
 $(VENV)/installed: pyproject.toml
@@ -27,6 +27,13 @@ test: $(VENV)/installed-dev
 
 test-long: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m long --timeout 3600 $(ARGS)
+
+# Coverage-guided, one parser after the other; what it finds interesting stays in tests/fuzz/corpus.
+FUZZ_S ?= 60
+FUZZ ?= native scip lms lms_requests ls100 rplidar rplidar_samples rplidar_capsules
+fuzz: $(VENV)/installed-dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[fuzz]'
+	for target in $(FUZZ); do $(BIN)/python -m tests.fuzz $$target -max_total_time=$(FUZZ_S) -max_len=2048 $(ARGS) || exit 1; done
 
 # Open3D is large, and wanted here only; JSON=FILE chooses where the figures go.
 bench: $(VENV)/installed

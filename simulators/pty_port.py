@@ -39,6 +39,7 @@ class SimulatedPortError(Exception):
     SimulatedPortError
     +-- LinkPathTaken     something that is not a link to a terminal is where the link should be
     +-- DeviceFailed      the simulated device raised; its exception is the cause
+    +-- UnknownDevice     no device of that name, or not with that rate
     """
 
 
@@ -48,6 +49,10 @@ class LinkPathTaken(SimulatedPortError):
 
 class DeviceFailed(SimulatedPortError):
     """The simulated device raised; its exception is the cause."""
+
+
+class UnknownDevice(SimulatedPortError):
+    """No device of that name can be simulated, or not with that rate."""
 
 
 class SerialDevice(Protocol):

@@ -145,7 +145,7 @@ class Ls100Host(Conversation):
         within_s = 0.1 + 2 * (len(request) + 516) * _BITS_PER_BYTE / self.baud_rate
         for _ in range(tries):
             self._say(request)
-            reply = yield Answer(lambda item: isinstance(item, Frame), within_s)
+            reply: Frame | None = yield Answer(lambda item: isinstance(item, Frame), within_s)
             if reply is not None and reply.whole == request:
                 if not self._has_echo:
                     self._has_echo = True

@@ -3,9 +3,9 @@
 A name here is what a rig file, the command line and an entry point may say. It knows no protocol itself.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from drivers.errors import DriverError, PortError, ScannerError
 from drivers.protocols import lms_host, ls100_host, rplidar_host, scip_host
@@ -14,10 +14,12 @@ from drivers.scanners.face import FreeRunningScanner, Scanner
 from drivers.scanners.lms import open_lms
 from drivers.scanners.ls100 import open_ls100
 from drivers.scanners.native import NativeScanner
+from drivers.scanners.options import Value, options_from
 from drivers.scanners.rplidar import open_rplidar
 from drivers.scanners.scip import open_scip
 
-Opener: TypeAlias = Callable[[str, int], Scanner]
+Opener: TypeAlias = Callable[..., Scanner]
+"""Called with a path and a rate, and with the options where there are any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +28,7 @@ class KnownScanner:
 
     `baud_rates` are those worth trying, the likeliest first. `opens` makes a driver for a path and a rate; nothing is
     opened before its `enter`. `runs_free` tells a `FreeRunningScanner` from one that has a stage of its own. A driver
-    that `tries_rates` begins with the given one and finds the others itself.
+    that `tries_rates` begins with the given one and finds the others itself. `options` is the class of its options.
     """
 
     name: str
@@ -35,6 +37,7 @@ class KnownScanner:
     opens: Opener
     runs_free: bool
     tries_rates: bool = True
+    options: type[Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +55,36 @@ KNOWN: dict[str, KnownScanner] = {
         KnownScanner(
             "native", "a scanner of the native protocol", (3_000_000, 921_600, 115_200), NativeScanner, False, False
         ),
-        KnownScanner("scip", "Hokuyo lidar, SCIP 2.0 (URG, UBG, UHG, UTM)", scip_host.RATES, open_scip, True),
-        KnownScanner("rplidar", "Slamtec RPLIDAR (A, S and C series)", rplidar_host.RATES, open_rplidar, True),
-        KnownScanner("lms200", "SICK LMS200, 211, 220, 221, 291", lms_host.RATES, open_lms, True),
-        KnownScanner("ls100", "SICK Profiler 2, Optex FASTUS LS-100", ls100_host.RATES, open_ls100, True),
+        KnownScanner(
+            "scip",
+            "Hokuyo lidar, SCIP 2.0 (URG, UBG, UHG, UTM)",
+            scip_host.RATES,
+            open_scip,
+            True,
+            True,
+            scip_host.ScipOptions,
+        ),
+        KnownScanner(
+            "rplidar",
+            "Slamtec RPLIDAR (A, S and C series)",
+            rplidar_host.RATES,
+            open_rplidar,
+            True,
+            True,
+            rplidar_host.RplidarOptions,
+        ),
+        KnownScanner(
+            "lms200", "SICK LMS200, 211, 220, 221, 291", lms_host.RATES, open_lms, True, True, lms_host.LmsOptions
+        ),
+        KnownScanner(
+            "ls100",
+            "SICK Profiler 2, Optex FASTUS LS-100",
+            ls100_host.RATES,
+            open_ls100,
+            True,
+            True,
+            ls100_host.Ls100Options,
+        ),
     )
 }
 
@@ -67,13 +96,21 @@ def known_scanner(name: str) -> KnownScanner:
     return KNOWN[name]
 
 
-def open_scanner(name: str, path: str, baud_rate: int | None = None) -> Scanner:
+def open_scanner(
+    name: str, path: str, baud_rate: int | None = None, options: Mapping[str, Value] | None = None
+) -> Scanner:
     """A driver for the scanner of that name on `path`, not yet entered.
 
-    Without a rate it is the kind's likeliest one; `identify` finds the right one by trying.
+    Without a rate it is the kind's likeliest one; `identify` finds the right one by trying. `options` are plain values,
+    as a file has them; raises DriverError for those that the kind does not have.
     """
     known = known_scanner(name)
-    return known.opens(path, known.baud_rates[0] if baud_rate is None else baud_rate)
+    rate = known.baud_rates[0] if baud_rate is None else baud_rate
+    if not options:
+        return known.opens(path, rate)
+    if known.options is None:
+        raise DriverError(f"scanner {name} has no option {next(iter(options))!r}; it has none")
+    return known.opens(path, rate, options_from(known.options, options))
 
 
 def open_free_running(name: str, path: str, baud_rate: int | None = None) -> FreeRunningScanner:
