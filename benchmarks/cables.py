@@ -6,6 +6,7 @@ whether anything is left behind, and how much of the line's time the driver keep
 
 import argparse
 import json
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -97,11 +98,11 @@ def main() -> None:
     parser.add_argument("kind", choices=KNOWN_DEVICES)
     parser.add_argument("--cycles", type=int, default=100)
     parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--link", type=Path, default=Path("/tmp/scanner-cable"))
     given = parser.parse_args()
     figures = {"keep_up": keep_up(given.kind, given.seconds)}
     if given.cycles:
-        figures["cable"] = pull_and_return(given.kind, given.cycles, given.link)
+        with tempfile.TemporaryDirectory() as folder:
+            figures["cable"] = pull_and_return(given.kind, given.cycles, Path(folder) / "scanner")
     print(json.dumps({"kind": given.kind} | figures), flush=True)
 
 

@@ -1,6 +1,8 @@
 """Scanners by name: plain values become options, and what cannot be is said in one sentence."""
 
 import math
+import re
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +15,8 @@ from drivers.scanners.free_running import FreeRunner
 from drivers.scanners.known import KNOWN, known_scanner, open_free_running, open_scanner
 from drivers.scanners.native import NativeScanner
 from drivers.scanners.options import options_from
+
+PAGES = Path(__file__).resolve().parents[3] / "docs" / "devices"
 
 
 def test_each_name_makes_its_driver_without_opening_anything() -> None:
@@ -65,3 +69,15 @@ def test_options_that_cannot_be_are_told(kind: type, values: dict[str, object], 
 def test_options_of_a_kind_that_has_none_are_refused() -> None:
     with pytest.raises(DriverError, match="native has no option 'speed'; it has none"):
         open_scanner("native", "/dev/none", None, {"speed": 1})
+
+
+@pytest.mark.parametrize("name", [name for name, known in KNOWN.items() if known.options is not None])
+def test_the_page_of_each_scanner_names_its_options_and_no_others(name: str) -> None:
+    text = (PAGES / f"{name}.md").read_text(encoding="utf-8")
+    table = re.search(r"^\| option .*?\n\n", text, re.MULTILINE | re.DOTALL)[0]
+    named = {word for row in table.strip().splitlines()[2:] for word in re.findall(r"`(\w+)`", row.split("|")[1])}
+    with pytest.raises(DriverError) as refusal:
+        options_from(known_scanner(name).options, {"no_such_option": 1})
+    assert named == set(str(refusal.value).partition("its options are ")[2].split(", "))
+    rates = ", ".join(str(rate) for rate in KNOWN[name].baud_rates[:2])
+    assert name == "ls100" or all(rate in text for rate in rates.split(", "))
