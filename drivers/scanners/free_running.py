@@ -7,7 +7,6 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from types import TracebackType
 from typing import Self, TypeAlias
 
@@ -157,8 +156,7 @@ class FreeRunner:
             if self._host is None:
                 return Tally()
             tally = self._host.tally()
-            overruns = 0 if self._link is None else self._link.overruns
-        return replace(tally, damage=tally.damage | {"uart_overrun": overruns}) if overruns else tally
+            return tally if self._link is None else self._link.with_overruns(tally)
 
     def exit(self) -> None:
         """Stop, switch the laser off, close the port; never raises, and returns within about 2 s."""

@@ -7,6 +7,7 @@ opens a lost port again. It never waits for whoever fetches the lines.
 import threading
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple, Protocol
 
 from drivers.errors import PortError, PortStalled
@@ -14,6 +15,7 @@ from drivers.port import LEAVE_LINES, ModemLines, Port, lasting_path
 from drivers.protocols.scanner_events import ScannerEvent
 from drivers.scanline import Profile
 from drivers.scanners.face import Happening
+from drivers.tally import Tally
 
 _READ_S = 0.02
 _REOPEN_S = 0.1
@@ -59,7 +61,7 @@ class Host(Protocol):
 class Inbox:
     """Lines and events that wait to be fetched; the caller holds the lock.
 
-    At most `queue_lines` lines wait: `deliver` says no to more. Of events at most 1,000 wait.
+    At most `queue_lines` lines wait: `deliver` says no to more. Of events at most 1,000 wait, further ones are lost.
     """
 
     def __init__(self, queue_lines: int) -> None:
@@ -135,6 +137,10 @@ class Link:
         """End the thread, which closes the port."""
         self._closing.set()
         self._thread.join()
+
+    def with_overruns(self, tally: Tally) -> Tally:
+        """The accounts, with the bytes that nobody read in time among the damage."""
+        return replace(tally, damage=tally.damage | {"uart_overrun": self.overruns}) if self.overruns else tally
 
     def _run(self, port: Port | None) -> None:
         try:

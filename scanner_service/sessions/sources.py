@@ -26,7 +26,8 @@ from drivers.protocols.scanner_events import (
 )
 from drivers.rig import Rig
 from drivers.scanline import DeviceInfo, Float64Array, Profile, Scanline, SensorGeometry
-from drivers.scanners.native import Happening, NativeScanner
+from drivers.scanners.face import Happening
+from drivers.scanners.native import NativeScanner
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.storage.errors import RecordError
