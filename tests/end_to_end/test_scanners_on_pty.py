@@ -103,7 +103,7 @@ def test_a_replugged_cable_is_healed_under_another_name(name: str, tmp_path: Pat
         catch = Catch(scanner)
         scanner.start_profiles()
         catch.until(lambda: len(catch.lines) >= 3)
-        for cycle in range(3):
+        for cycle in range(2):
             before = len(catch.lines)
             port.unplug()
             catch.until(lambda cycle=cycle: catch.count(Disconnected) == cycle + 1)
@@ -128,7 +128,6 @@ def test_a_port_on_which_nobody_is_says_so_and_lets_go() -> None:
         def next_due_s(self, now_s: float) -> float | None:
             return None
 
-    with PtyPort(Mute(), 115_200) as port:
-        for name in DEVICES:
-            with pytest.raises(ScannerSilent, match="check its power"):
-                open_free_running(name, str(port.path)).enter()
+    sentence = r"no LMS2xx answers at 9600, .* check its power"
+    with PtyPort(Mute(), 9_600) as port, pytest.raises(ScannerSilent, match=sentence):
+        open_free_running("lms200", str(port.path)).enter()
