@@ -81,7 +81,7 @@ class LmsOptions:
 class LmsHost(Conversation):
     """One conversation with one LMS2xx. Between two bytes of a telegram it pauses for 14 ms at most."""
 
-    break_after_s = 0.06
+    break_after_s = 0.15
 
     def __init__(
         self,

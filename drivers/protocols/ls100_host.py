@@ -69,7 +69,7 @@ _Result: TypeAlias = tuple[float, int | None, Float64Array, Float64Array, Float6
 class Ls100Host(Conversation):
     """One conversation with one sensor. Its laser shines for as long as it has power: there is no command for it."""
 
-    break_after_s = 0.05
+    break_after_s = 0.09
 
     def __init__(
         self,
