@@ -33,6 +33,7 @@ from drivers.protocols.stage_events import Reading, StageEvent
 from drivers.protocols.stage_host import Errand, Kind, Phase, StageHost
 
 POLL_S = 0.2
+_STOP_POLL_S = 0.1
 _REST_POLL_S = 0.5
 _STEP_S = 0.6
 _BANNER_S = 2.5
@@ -145,6 +146,8 @@ class GrblHost(StageHost):
         self._offset = ()
         self._lose_position(f"the controller started anew ({identity})", now_s)
         if self.phase is Phase.UP:
+            if self.errand is not None and self.errand.kind is Kind.STOP:
+                self._done()
             self._fail(StageAlarm("the controller was reset in the middle; home before the next motion"))
             self.phase = Phase.GREETING
         self._identify(now_s)
@@ -182,7 +185,8 @@ class GrblHost(StageHost):
         why = explain_alarm(alarm.code)
         if alarm.loses_position:
             self._lose_position(why, now_s)
-        self._fail(StageAlarm(f"the controller has locked itself: {why}; clear the cause, then home"))
+        if self.errand is None or self.errand.kind is not Kind.STOP:  # at rest it is, which is all a stop wants
+            self._fail(StageAlarm(f"the controller has locked itself: {why}; clear the cause, then home"))
 
     def _reported(self, report: Report, now_s: float) -> None:
         asked_s, self._asked_s = self._asked_s, None
@@ -273,8 +277,7 @@ class GrblHost(StageHost):
 
     def _stop(self, errand: Errand, now_s: float) -> None:
         self._waiting.clear()
-        if self._state is State.HOME:
-            self._lose_position("homing was stopped", now_s)
+        if self._interrupted is Kind.HOME:  # only a reset ends homing; the position was lost at its beginning
             self._overtake(SOFT_RESET)
         else:
             self._overtake(JOG_CANCEL)
@@ -301,7 +304,10 @@ class GrblHost(StageHost):
     def _ask(self, now_s: float) -> None:
         self.outbox.put(STATUS)
         self._asked_s = now_s
-        self._next_poll_s = now_s + (POLL_S if self.is_busy or self.phase is Phase.GREETING else _REST_POLL_S)
+        is_stopping = self.is_busy and self.errand is not None and self.errand.kind is Kind.STOP
+        self._next_poll_s = now_s + (
+            _STOP_POLL_S if is_stopping else POLL_S if self.is_busy or self.phase is Phase.GREETING else _REST_POLL_S
+        )
 
     def _tick(self, now_s: float) -> None:
         if self.phase is Phase.GREETING:

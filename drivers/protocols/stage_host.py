@@ -96,7 +96,7 @@ class StageHost(ABC):
         self._tolerance = tolerance
         self._heard_s = self._opened_s = 0.0
         self._lost_s: float | None = None
-        self._restarted = False
+        self._interrupted: Kind | None = None  # what the stop under way ended
 
     # ---- the link ---------------------------------------------------------------------------------------------------
 
@@ -106,7 +106,6 @@ class StageHost(ABC):
         self.outbox.clear()
         self.lines.forget()
         self._heard_s = self._opened_s = now_s
-        self._restarted = False
         self._greet(now_s)
 
     def link_lost(self, reason: str, now_s: float) -> None:
@@ -162,6 +161,7 @@ class StageHost(ABC):
 
     def stop(self, now_s: float) -> Errand:
         """Stop, before anything that waits to be sent; what was under way has failed as stopped."""
+        self._interrupted = self.errand.kind if self.errand is not None and not self.errand.is_over else None
         self._fail(StageStopped("the motion was stopped before its target"))
         return self._begin(Errand(Kind.STOP, now_s + 10.0), now_s)
 

@@ -39,6 +39,7 @@ class GrblDevice:
         self._out = bytearray()
         self._rx = bytearray()
         self._lines: deque[str] = deque()
+        self._after_return = False
         self._boot(alarm=bool(self.settings[22]) and not homed)
 
     # ---- what a test may do -----------------------------------------------------------------------------------------
@@ -107,7 +108,6 @@ class GrblDevice:
         self._dwell_s = -math.inf
         self._reports = 0
         self._is_jog = False
-        self._after_return = False
         self._say("")
         self._say("Grbl 1.1h ['$' for help]")
         if alarm:
