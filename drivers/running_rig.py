@@ -17,6 +17,7 @@ from typing import Self, TypeAlias, cast
 from drivers.errors import DriverError, ScannerSilent, StageError, StageNotConnected, StageStopped
 from drivers.pairing import PairedProfile, StagePosition, TimePairing
 from drivers.pass_accounts import PassAccounts, PassReport
+from drivers.port_names import find_port
 from drivers.protocols.scanner_events import (
     Disconnected,
     PassEnded,
@@ -81,7 +82,9 @@ class RunningRig:
         self._description = description
         self._rig: Rig = description.rig()
         choice = description.scanner
-        self._scanner = scanner or open_scanner(choice.kind, choice.port or "", choice.baud_rate)
+        if choice.options:
+            raise DriverError(f"scanner {choice.kind} has no option {next(iter(choice.options))}; it has none")
+        self._scanner = scanner or open_scanner(choice.kind, find_port(choice.port or ""), choice.baud_rate)
         self._runs_free = known_scanner(choice.kind).runs_free
         self._stage = stage or open_stage(description)
         self._is_driven = known_stage(description.stage.kind).is_driven

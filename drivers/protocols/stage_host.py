@@ -17,6 +17,7 @@ from drivers.protocols.text_lines import TextLines
 NOT_HOMED = "the stage has not homed since it was connected"
 HOMING_S = 120.0
 SILENCE_S = 3.0
+_LISTENED_S = 0.25
 
 
 class Phase(Enum):
@@ -95,6 +96,7 @@ class StageHost(ABC):
         self._on_event = on_event
         self._tolerance = tolerance
         self._heard_s = self._opened_s = 0.0
+        self._quiet_s = self._ticked_s = 0.0
         self._lost_s: float | None = None
         self._interrupted: Kind | None = None  # what the stop under way ended
 
@@ -105,7 +107,8 @@ class StageHost(ABC):
         self.phase = Phase.GREETING
         self.outbox.clear()
         self.lines.forget()
-        self._heard_s = self._opened_s = now_s
+        self._heard_s = self._opened_s = self._ticked_s = now_s
+        self._quiet_s = 0.0
         self._greet(now_s)
 
     def link_lost(self, reason: str, now_s: float) -> None:
@@ -121,22 +124,26 @@ class StageHost(ABC):
         """Take in what the controller sent."""
         if data:
             self._heard_s = now_s
+            self._quiet_s = 0.0
             self.heard_bytes += len(data)
         for line in self.lines.receive(data):
             self._hear(line, now_s)
 
     def tick(self, now_s: float) -> None:
         """Do what is due by now."""
+        # A program that was held up for a while has not listened: only time in which it did counts as silence.
+        self._quiet_s += min(max(0.0, now_s - self._ticked_s), _LISTENED_S)
+        self._ticked_s = now_s
         errand = self.errand
         if errand is not None and not errand.is_over and now_s > errand.give_up_s:
             self._run_out(errand, now_s)
         if self.phase is not Phase.DOWN:
             self._tick(now_s)
 
-    def is_silent(self, now_s: float) -> bool:
+    def is_silent(self) -> bool:
         """True when the controller should have said something and has not; not while it homes, when some are mute."""
         homing = self.errand is not None and self.errand.kind is Kind.HOME and not self.errand.is_over
-        return self.phase is Phase.UP and not homing and now_s - self._heard_s > SILENCE_S
+        return self.phase is Phase.UP and not homing and self._quiet_s > SILENCE_S
 
     # ---- errands ----------------------------------------------------------------------------------------------------
 

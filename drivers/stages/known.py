@@ -4,7 +4,7 @@ A name here is what a rig file may say. It knows no controller itself.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TypeAlias
 
@@ -32,7 +32,7 @@ class KnownStage:
     baud_rates: tuple[int, ...]
     opens: Opener
     is_driven: bool = True
-    options: Mapping[str, OptionSpec] = MappingProxyType({})
+    options: Mapping[str, OptionSpec] = field(default_factory=lambda: MappingProxyType({}))
 
 
 KNOWN: Mapping[str, KnownStage] = MappingProxyType(

@@ -23,7 +23,7 @@ from drivers.errors import (
     StageSilent,
     StageTimeout,
 )
-from drivers.port import ModemLines, Port
+from drivers.port import ModemLines, Port, lasting_path
 from drivers.port_names import find_port
 from drivers.protocols.stage_events import (
     Reading,
@@ -40,7 +40,6 @@ HostMaker: TypeAlias = Callable[[Callable[[Reading], None], Callable[[StageEvent
 _AS_IT_IS = ModemLines()
 _READ_S = 0.02
 _REOPEN_S = 0.1
-_ENTER_S = 12.0
 _STALL_S = 1.0
 _EXIT_S = 3.0
 _MAX_READINGS = 10_000
@@ -60,6 +59,7 @@ class SerialStage:
     travel_mm, speed_mm_per_s : the soft limits.
     mm_per_unit : millimetres of travel in one unit of the controller.
     lines : how DTR and RTS are to stand; boards exist that start anew when they move.
+    patience_s : how long `enter` waits for an answer; a board that starts anew when it is opened needs some seconds.
     """
 
     def __init__(
@@ -73,6 +73,7 @@ class SerialStage:
         mm_per_unit: float = 1.0,
         lines: ModemLines = _AS_IT_IS,
         clock: Callable[[], float] = time.monotonic,
+        patience_s: float = 12.0,
     ) -> None:
         self._makes_host = makes_host
         self._port_name = port_name
@@ -82,6 +83,8 @@ class SerialStage:
         self._mm_per_unit = mm_per_unit
         self._lines = lines
         self._clock = clock
+        self._patience_s = patience_s
+        self._opens = port_name
         self._changed = threading.Condition()  # guards everything below except the port, which is the thread's
         self._host = makes_host(self._take_reading, self._take_event)
         self._zero_mm = 0.0  # position of the stage where the controller says 0
@@ -116,7 +119,9 @@ class SerialStage:
         """
         if self._thread is not None:
             raise DriverError(f"{self._port_name} has been entered already; exit first")
-        port = Port(find_port(self._port_name), self._baud_rate, self._lines)
+        path = find_port(self._port_name)
+        self._opens = self._port_name if self._port_name.startswith("usb:") else lasting_path(path)
+        port = Port(path, self._baud_rate, self._lines)
         self._closing.clear()
         self._failure = None
         self._host = self._makes_host(self._take_reading, self._take_event)
@@ -130,7 +135,7 @@ class SerialStage:
                     or self._host.refusal is not None
                     or self._failure is not None
                 ),
-                _ENTER_S,
+                self._patience_s,
             )
             host, failure, is_up = self._host, self._failure, self._host.phase is Phase.UP
             self._identity = host.identity
@@ -373,7 +378,7 @@ class SerialStage:
             host = self._host
             host.receive(data, now_s)
             host.tick(now_s)
-            if host.is_silent(now_s):
+            if host.is_silent():
                 raise PortStalled(port.path, f"the stage on {port.path} has fallen silent; check cable and power")
             if len(host.outbox):
                 written = port.write(host.outbox.peek())
@@ -415,7 +420,7 @@ class SerialStage:
         """Wait a little and try the name once."""
         self._closing.wait(_REOPEN_S)
         try:
-            port = Port(find_port(self._port_name), self._baud_rate, self._lines)
+            port = Port(find_port(self._opens), self._baud_rate, self._lines)
         except PortError:
             return None
         with self._changed:

@@ -13,7 +13,7 @@ from simulators.devices.motion import Axes, Vector
 RX_BYTES = 128
 LINE_CHARACTERS = 80
 BLOCKS = 15
-_HOMING_S = 0.6
+_HOMING_S = 0.3
 _PULL_OFF_MM = 1.0
 _FIRST_SETTINGS = {
     0: 10, 1: 25, 2: 0, 3: 0, 4: 0, 5: 0, 6: 0, 10: 1, 11: 0.01, 12: 0.002, 13: 0, 20: 0, 21: 0, 22: 1, 23: 0,

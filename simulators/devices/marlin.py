@@ -12,7 +12,7 @@ from simulators.devices.motion import Axes
 
 BLOCKS = 16
 _KEEPALIVE_S = 2.0
-_HOMING_S = 0.8
+_HOMING_S = 0.3
 _WORD = re.compile(r"([A-Z])([+-]?(?:\d+\.?\d*|\.\d+)?)")
 
 
