@@ -17,6 +17,7 @@ $(VENV)/installed: pyproject.toml
 
 $(VENV)/installed-dev: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'printrun==2.2.0'  # its core, without wx
 	@touch $@
 
 demo: $(VENV)/installed

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from drivers.errors import DriverError, PortError, ScannerError
+from drivers.errors import DriverError, DriverUnknown, PortError, ScannerError
+from drivers.plugins import SCANNERS_GROUP, added, find_added
 from drivers.protocols import lms_host, ls100_host, rplidar_host, scip_host
 from drivers.scanline import DeviceInfo
 from drivers.scanners.face import FreeRunningScanner, Scanner
@@ -90,10 +91,14 @@ KNOWN: dict[str, KnownScanner] = {
 
 
 def known_scanner(name: str) -> KnownScanner:
-    """The kind of that name; raises DriverError naming those there are."""
-    if name not in KNOWN:
-        raise DriverError(f"there is no scanner {name!r}; the scanners are {', '.join(sorted(KNOWN))}")
-    return KNOWN[name]
+    """The kind of that name, or one that another package adds; raises DriverUnknown naming those there are."""
+    if name in KNOWN:
+        return KNOWN[name]
+    found = find_added(SCANNERS_GROUP, name, KnownScanner)
+    if found is None:
+        names = sorted({*KNOWN, *added(SCANNERS_GROUP)})
+        raise DriverUnknown(f"there is no scanner {name!r}; the scanners are {', '.join(names)}")
+    return found
 
 
 def open_scanner(

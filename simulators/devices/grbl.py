@@ -36,6 +36,7 @@ class GrblDevice:
         self.is_mute = False
         self.position_wrong_by: Vector = (0.0, 0.0, 0.0)
         self.lines_taken = 0
+        self.lost_characters = 0
         self._out = bytearray()
         self._rx = bytearray()
         self._lines: deque[str] = deque()
@@ -68,8 +69,10 @@ class GrblDevice:
         for byte in data:
             if self._realtime(byte, now_s):
                 continue
-            if len(self._rx) + sum(len(line) + 1 for line in self._lines) >= RX_BYTES:
-                continue  # a full buffer loses bytes, as the firmware's does
+            # The line that waits for the planner has left the buffer already.
+            if len(self._rx) + sum(len(line) + 1 for line in list(self._lines)[1:]) >= RX_BYTES:
+                self.lost_characters += 1  # a full buffer loses them, as the firmware's does
+                continue
             after_return, self._after_return = self._after_return, byte == 0x0D
             if byte == 0x0A and after_return:
                 continue  # the second half of one line end
@@ -197,7 +200,7 @@ class GrblDevice:
             if self._state == "Alarm" or (self.axes.is_moving(now_s) and not self._is_jog) or self._state == "Hold":
                 return "error:9" if self._state == "Alarm" else "error:8"
             return self._gcode(text[3:], now_s, jog=True)
-        if not is_free:
+        if not is_free and text not in ("$", "$G", "$C", "$X"):
             return "error:8"
         match text:
             case "$":

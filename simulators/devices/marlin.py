@@ -37,6 +37,7 @@ class MarlinDevice:
         self.is_mute = False
         self.swallow_oks = 0
         self.homed = False
+        self.resends = 0
         self._emergency_parser = emergency_parser
         self._answers_m92 = answers_m92
         self._fastest = speed_mm_per_s
@@ -102,7 +103,7 @@ class MarlinDevice:
 
     def _say(self, line: str) -> None:
         if not self.is_mute:
-            self._out += line.encode("ascii") + b"\n"
+            self._out += line.encode("ascii", "replace") + b"\n"
 
     def _ok(self, more: str = "") -> None:
         if self.swallow_oks:
@@ -156,6 +157,7 @@ class MarlinDevice:
         self._carry_out(command, now_s)
 
     def _want_again(self, why: str) -> None:
+        self.resends += 1
         self._say(f"Error:{why}, Last Line: {self._last_number}")
         self._lines.clear()
         self._say(f"Resend: {self._last_number + 1}")
