@@ -30,7 +30,7 @@ from drivers.protocols.stage_events import StageEvent, StageReconnected
 from drivers.rig import Rig
 from drivers.rig_description import PairBy, RigDescription
 from drivers.rig_limits import PassOrder, RigLimits
-from drivers.scanline import DeviceInfo, Profile, Scanline
+from drivers.scanline import DeviceInfo, Pose, Profile, Scanline
 from drivers.scanners.face import FreeRunningScanner, Scanner
 from drivers.scanners.known import known_scanner, open_scanner
 from drivers.scanners.native import NativeScanner
@@ -128,6 +128,15 @@ class RunningRig:
     def stage(self) -> Stage:
         """The stage: to home it, or to state where it is."""
         return self._stage
+
+    @property
+    def is_driven(self) -> bool:
+        """True when the host moves the stage; it is then a `DrivenStage`."""
+        return self._is_driven
+
+    def pose_at(self, position_mm: float) -> Pose:
+        """Return `part_from_sensor` at a stage position."""
+        return self._rig.part_from_sensor(position_mm)
 
     @property
     def laser_on(self) -> bool | None:

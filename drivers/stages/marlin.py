@@ -29,4 +29,5 @@ def open_marlin(setup: StageSetup) -> SerialStage:
         mm_per_unit=setup.mm_per_unit,
         lines=DTR_LINES[setup.flag("dtr")],
         clock=setup.clock,
+        patience_s=setup.patience_s,
     )

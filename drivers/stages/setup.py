@@ -28,7 +28,7 @@ class StageSetup:
     """Where a stage is, and within which limits it may be driven.
 
     `mm_per_unit` is millimetres of travel in one unit (mm or degree) of the controller; `options` are checked already
-    and complete.
+    and complete. `patience_s` is how long `enter` waits for an answer.
     """
 
     port_name: str = ""
@@ -38,6 +38,7 @@ class StageSetup:
     mm_per_unit: float = 1.0
     options: Mapping[str, Option] = field(default_factory=lambda: MappingProxyType({}))
     clock: Callable[[], float] = time.monotonic
+    patience_s: float = 12.0
 
     def text(self, name: str) -> str:
         """Return an option that is a text."""

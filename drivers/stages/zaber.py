@@ -34,4 +34,5 @@ def open_zaber(setup: StageSetup) -> SerialStage:
         speed_mm_per_s=setup.speed_mm_per_s,
         mm_per_unit=setup.mm_per_unit,
         clock=setup.clock,
+        patience_s=setup.patience_s,
     )

@@ -43,7 +43,8 @@ class Pass:
         """True when an accepted line of the pass lies closer than a quarter of the line spacing along the travel."""
         if not np.isfinite(line.travel).all():
             return False
-        station = float(line.laser_mm @ line.travel)
+        # On a turntable the laser never moves along the tangent it travels by; the stage position always tells.
+        station = line.position_mm if math.isfinite(line.position_mm) else float(line.laser_mm @ line.travel)
         closest = STATIONARY_SHARE * line.line_spacing_mm
         bin_index = math.floor(station / closest)
         for near in (bin_index - 1, bin_index, bin_index + 1):

@@ -16,7 +16,7 @@ MODULE = """
     from drivers.stages.grbl import OPTIONS, open_grbl
     from drivers.stages.known import KnownStage
 
-    STAGE = KnownStage("acme", "a stage of ACME", (9600,), open_grbl, True, OPTIONS)
+    STAGE = KnownStage("acme", "a stage of ACME", (9600,), open_grbl, options=OPTIONS)
     SCANNER = KnownScanner("acme", "a scanner of ACME", (9600,), lambda path, rate: (path, rate), True)
     WRONG = 42
 """
