@@ -78,9 +78,10 @@ class StageTrack:
     Notes
     -----
     The uncertainty adds what the readings themselves may be off, the speed times how uncertain both moments are (a
-    reading was taken at some moment between question and answer), and, for one change of speed between two readings,
-    dt/4 times the difference of the speeds before and after: the most by which a line with one corner can leave its
-    chord.
+    reading was taken at some moment between question and answer: it counts twice, for the chord and for its bend, and
+    the speed between two readings may be as much higher as they may lie closer), and, for one change of speed between
+    two readings, dt/4 times the difference of the speeds before and after: the most by which a line with one corner can
+    leave its chord.
     """
 
     def __init__(self) -> None:
@@ -125,10 +126,11 @@ class StageTrack:
             speeds.append(self._speed(after - 2))
         if after + 1 < len(self._readings):
             speeds.append(self._speed(after))
-        moment_s = max(_half_s(a), _half_s(b)) + half_width_s
+        reading_s = max(_half_s(a), _half_s(b))
+        fastest = max(map(abs, speeds)) * span_s / max(span_s - 2.0 * reading_s, 0.25 * span_s)
         bend_mm = (max(speeds) - min(speeds)) * span_s / 4.0
         own_mm = max(a.uncertainty_mm, b.uncertainty_mm)
-        return StagePosition(position_mm, own_mm + max(map(abs, speeds)) * moment_s + bend_mm)
+        return StagePosition(position_mm, own_mm + fastest * (2.0 * reading_s + half_width_s) + bend_mm)
 
     def _speed(self, first: int) -> float:
         a, b = self._readings[first], self._readings[first + 1]
