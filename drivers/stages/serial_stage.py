@@ -157,6 +157,9 @@ class SerialStage:
         thread.join()
         self._thread = None
         self._latest = None
+        with self._changed:  # whoever still waits, in another thread, waits for nobody
+            self._host.link_lost("the port was closed", self._clock())
+            self._changed.notify_all()
 
     @property
     def is_connected(self) -> bool:
@@ -275,6 +278,8 @@ class SerialStage:
         StageTimeout, StageNotConnected : when the controller does not confirm; treat the stage as moving.
         """
         with self._changed:
+            if self._thread is None:
+                return  # left, and stopped then
             errand = self._host.stop(self._clock())
         self._wait_for(errand)
 

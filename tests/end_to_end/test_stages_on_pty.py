@@ -94,6 +94,7 @@ def test_leaving_stops_the_motion_and_frees_the_port(kind):
         stage.exit()
         assert not device.axes.is_moving(time.monotonic())
         stage.exit()
+        stage.stop()  # there is nothing left to stop
         with pytest.raises(StageNotConnected):
             stage.home()
         stage.enter()
