@@ -165,13 +165,16 @@ def _check_stop(stage: DrivenStage, laws: _Laws, a_mm: float, speed: float) -> N
     laws.hold("a stop ends the motion on its way", not (places and abs(places[-1] - a_mm) < 0.05), places)
 
 
-def check_scanner(make: Callable[[], FreeRunningScanner], lines: int = 20) -> list[str]:
+def check_scanner(
+    make: Callable[[], FreeRunningScanner], lines: int = 20, *, laser_always_on: bool = False
+) -> list[str]:
     """Run a scanner that runs free through its contract; return the laws that were checked.
 
     Parameters
     ----------
     make : returns a driver that is not entered; called once.
     lines : how many profiles to wait for.
+    laser_always_on : True for a scanner whose laser no command switches off; it must then say so, as on or unknown.
 
     Raises
     ------
@@ -183,12 +186,18 @@ def check_scanner(make: Callable[[], FreeRunningScanner], lines: int = 20) -> li
     try:
         info = scanner.enter()
         laws.hold("enter says who answers", bool(info.device_id) and info.points_per_line > 0, info)
-        laws.hold("the laser is not on before it is asked for", scanner.laser_on is not True)
+        if laser_always_on:
+            laws.hold("a laser that is always on is never called off", scanner.laser_on is not False)
+        else:
+            laws.hold("the laser is not on before it is asked for", scanner.laser_on is not True)
         pass_index = scanner.start_profiles()
         profiles, _ = _collect(scanner, lambda found, _: len(found) >= lines)
         laws.hold(f"{lines} profiles come", len(profiles) >= lines, len(profiles))
         scanner.stop_profiles()
-        laws.hold("the laser is off after stopping", scanner.laser_on is False, scanner.laser_on)
+        if laser_always_on:
+            laws.hold("nor after stopping", scanner.laser_on is not False)
+        else:
+            laws.hold("the laser is off after stopping", scanner.laser_on is False, scanner.laser_on)
         more, told = _collect(scanner, lambda _, events: any(isinstance(event, PassEnded) for event in events))
         laws.hold("PassEnded is told after stopping", any(isinstance(event, PassEnded) for event in told))
         _check_profiles(laws, [*profiles, *more], pass_index)

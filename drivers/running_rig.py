@@ -82,9 +82,9 @@ class RunningRig:
         self._description = description
         self._rig: Rig = description.rig()
         choice = description.scanner
-        if choice.options:
-            raise DriverError(f"scanner {choice.kind} has no option {next(iter(choice.options))}; it has none")
-        self._scanner = scanner or open_scanner(choice.kind, find_port(choice.port or ""), choice.baud_rate)
+        self._scanner = scanner or open_scanner(
+            choice.kind, find_port(choice.port or ""), choice.baud_rate, choice.options
+        )
         self._runs_free = known_scanner(choice.kind).runs_free
         self._stage = stage or open_stage(description)
         self._is_driven = known_stage(description.stage.kind).is_driven

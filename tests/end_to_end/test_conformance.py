@@ -1,15 +1,13 @@
 """Our own drivers keep the contract that others are held to, and a driver that breaks it is told every law it broke."""
 
-import numpy as np
 import pytest
 
 from drivers.conformance import ContractBroken, check_scanner, check_stage
 from drivers.scanners.known import open_free_running
 from drivers.stages.face import StageReading
-from simulators.devices.scip import ScipDevice
 from simulators.pty_port import PtyPort
 from tests.end_to_end.stages import BAUD, KINDS, new_device, open_stage, signed
-from tests.unit.drivers.conversation_bench import flat_scene
+from tests.end_to_end.test_scanners_on_pty import DEVICES, plugged
 
 
 @pytest.mark.parametrize("kind", ["grbl", *[pytest.param(kind, marks=pytest.mark.long) for kind in KINDS[1:]]])
@@ -21,10 +19,12 @@ def test_every_stage_keeps_the_contract(kind):
     assert len(kept) > 20
 
 
-def test_a_scanner_keeps_the_contract():
-    device = ScipDevice(flat_scene())
-    with PtyPort(device, device.baud_rate, rng=np.random.default_rng(1), heeds_client_rate=True) as port:
-        kept = check_scanner(lambda: open_free_running("scip", str(port.path)), lines=5)
+@pytest.mark.parametrize(
+    "name", ["scip", *[pytest.param(name, marks=pytest.mark.long) for name in DEVICES if name != "scip"]]
+)
+def test_every_scanner_keeps_the_contract(name):
+    with plugged(name) as port:
+        kept = check_scanner(lambda: open_free_running(name, str(port.path)), lines=5, laser_always_on=name == "lms200")
     assert len(kept) > 15
 
 
