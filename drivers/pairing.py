@@ -47,10 +47,16 @@ class ClockOffset:
         self._offset_s = math.nan
         self._at_s = 0.0
         self._late = 0
+        self._device_s = math.nan
+        self.period_s = 0.0
+        """The shortest time between two profiles by the scanner's clock; 0 before there are two."""
         self.jumps = 0
 
     def enter(self, device_time_s: float, arrival_s: float) -> None:
         """Take in a profile's two stamps."""
+        gap_s, self._device_s = device_time_s - self._device_s, device_time_s
+        if gap_s > 0.0:
+            self.period_s = min(gap_s, self.period_s) if self.period_s else gap_s
         difference_s = arrival_s - device_time_s
         aged_s = self.offset_s(arrival_s)
         if math.isnan(aged_s) or difference_s <= aged_s:

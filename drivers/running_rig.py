@@ -57,6 +57,9 @@ _MAX_EVENTS = 1_000
 _BACK_S = 120.0
 _FIRST_PROFILE_S = 10.0
 _MEASURE_RATE_S = 0.6
+_PERIODS_AT_REST = 3.0
+"""A line at rest is taken so many line periods after the stage has stopped: a latency of up to that, which the rig file
+does not tell, then does no harm."""
 _EDGE_MM = 1e-3
 """Lines this far outside the ends of a pass still belong to it."""
 
@@ -373,13 +376,14 @@ class RunningRig:
                 self._put(event)
 
     def _profile_after(self, time_s: float, pairing: TimePairing) -> Profile:
-        """Return the first profile exposed after `time_s`; those before are left out."""
+        """Return the first profile exposed well after `time_s`; those before are left out."""
         give_up_s = self._clock() + _FIRST_PROFILE_S
         found: Profile | None = None
         while found is None:
             for profile in self._fetch(_LOOK_S):
                 pairing.clock.enter(profile.device_time_s, profile.arrival_s)
-                if found is None and pairing.exposure_s(profile) > time_s:
+                settled_s = time_s + _PERIODS_AT_REST * pairing.clock.period_s
+                if found is None and pairing.exposure_s(profile) > settled_s:
                     self._accounts.profiles += 1
                     found = profile
                 else:
