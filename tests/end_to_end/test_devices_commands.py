@@ -80,6 +80,7 @@ def test_the_doctor_finds_a_sound_rig_sound_and_warns_of_what_will_be_refused(be
     assert "--home" in told
 
 
+@pytest.mark.long
 def test_the_doctor_names_the_kind_that_answers_instead(bench):
     status, told, _ = run("doctor", bench(stage_kind="marlin"), "--json")
     assert status == 1

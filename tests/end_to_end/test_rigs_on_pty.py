@@ -184,6 +184,7 @@ def test_measuring_at_rest_puts_each_line_where_the_stage_stood(stack):
     assert bench.rig.laser_on is False
 
 
+@pytest.mark.long
 def test_a_lidar_before_a_turntable_gives_scanlines_all_around(stack):
     bench = Bench(stack, axis=TURNTABLE)
     lines, _, ended = bench.scan(PassOrder(-5.0, -15.0, 5.0, 0.0))
@@ -208,6 +209,7 @@ def test_a_stop_ends_the_pass_with_the_stage_at_rest_and_the_laser_off(stack):
     assert bench.device.axes.position(time.monotonic())[0] > -60.0
 
 
+@pytest.mark.long
 def test_a_pulled_cable_of_the_stage_pauses_the_pass_and_it_goes_on_behind_the_last_line(stack, tmp_path):
     bench = Bench(stack, link=tmp_path / "stage")
     bench.rig.start(PassOrder(-5.0, -15.0, 0.5, 5.0))

@@ -23,6 +23,10 @@ from tests.end_to_end.running import wait_for
 from tests.end_to_end.stages import BAUD, KINDS, open_stage, signed, stage_on_pty, where_mm
 
 every_kind = pytest.mark.parametrize("kind", KINDS)
+# The conversations are held to these laws in simulated time; the thread and the port, which are one, are held here.
+one_kind_or_all = pytest.mark.parametrize(
+    "kind", ["grbl", *[pytest.param(kind, marks=pytest.mark.long) for kind in KINDS if kind != "grbl"]]
+)
 
 
 @every_kind
@@ -41,7 +45,7 @@ def test_a_stage_homes_goes_where_it_is_sent_and_tells_where_it_was(kind):
         assert stage.position_mm == pytest.approx(signed(kind, 12.5), abs=0.02)
 
 
-@every_kind
+@one_kind_or_all
 def test_nothing_is_sent_beyond_the_limits_or_while_the_position_is_unknown(kind):
     with stage_on_pty(kind, travel_mm=(-50.0, 50.0)) as (stage, device, _):
         with pytest.raises(StagePositionUnknown, match="home it, or state where it is"):
@@ -61,7 +65,7 @@ def test_nothing_is_sent_beyond_the_limits_or_while_the_position_is_unknown(kind
         stage.stop()
 
 
-@every_kind
+@one_kind_or_all
 def test_a_stop_from_another_thread_ends_a_motion_that_is_waited_for(kind):
     with stage_on_pty(kind) as (stage, device, _):
         stage.home()
@@ -83,7 +87,7 @@ def test_a_stop_from_another_thread_ends_a_motion_that_is_waited_for(kind):
         assert abs(where_mm(kind, device, time.monotonic())) < 100.0
 
 
-@every_kind
+@one_kind_or_all
 def test_leaving_stops_the_motion_and_frees_the_port(kind):
     with stage_on_pty(kind) as (stage, device, port):
         stage.home()
@@ -101,7 +105,7 @@ def test_leaving_stops_the_motion_and_frees_the_port(kind):
         assert stage.is_connected
 
 
-@every_kind
+@one_kind_or_all
 def test_a_pulled_cable_is_told_and_the_position_is_kept(kind, tmp_path):
     with stage_on_pty(kind, tmp_path / "stage") as (stage, _, port):
         stage.home()
