@@ -10,8 +10,10 @@ from scanner_service import __version__
 from scanner_service.commands.analyse import analyse_command
 from scanner_service.commands.bench import bench_app
 from scanner_service.commands.demo import demo_command
+from scanner_service.commands.devices import devices_command, doctor_command
 from scanner_service.commands.open_viewer import open_command
 from scanner_service.commands.replay import replay_command
+from scanner_service.commands.scan import scan_command
 from scanner_service.commands.serve import DEFAULT_DATA, serve_command
 from scanner_service.commands.simulate import simulate_command
 
@@ -25,6 +27,9 @@ app = typer.Typer(
 app.command("serve")(serve_command)
 app.command("open")(open_command)
 app.command("demo")(demo_command)
+app.command("scan")(scan_command)
+app.command("devices")(devices_command)
+app.command("doctor")(doctor_command)
 app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)
 app.command("simulate")(simulate_command)

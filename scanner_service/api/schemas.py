@@ -31,6 +31,19 @@ class DeviceSourceIn(_Strict):
     line_rate_hz: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] = 50.0
 
 
+class RigSourceIn(_Strict):
+    """One pass of a rig whose file lies in the service's folder of rigs; `rig` is its bare name. It moves the stage."""
+
+    kind: Literal["rig"]
+    rig: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00]+$", examples=["bench.toml"])]
+    line_spacing_mm: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.2
+    start_mm: Finite
+    end_mm: Finite
+    speed_mm_per_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    home: bool = False
+    at_mm: Finite | None = None
+
+
 class ReplaySourceIn(_Strict):
     """A recorded scan that lies in the service's replay folder; `file` is its bare name."""
 
@@ -69,7 +82,7 @@ class SessionIn(_Strict):
     """A session to be made."""
 
     name: Annotated[str, Field(min_length=1, max_length=200)] = "scan"
-    source: Annotated[DeviceSourceIn | ReplaySourceIn | PushSourceIn, Field(discriminator="kind")]
+    source: Annotated[DeviceSourceIn | RigSourceIn | ReplaySourceIn | PushSourceIn, Field(discriminator="kind")]
     settings: SettingsIn = SettingsIn()
     origin_mm: Vector = (0.0, 0.0, 0.0)
 

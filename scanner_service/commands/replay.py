@@ -78,16 +78,16 @@ def replay_command(
             book = SessionBook(opened)
             stack.callback(book.close)
             live = book.create(file.name, spec, settings, origin_mm, source)
-            _play(live, quiet=as_json)
+            play(live, quiet=as_json)
             summary = write_outputs(out, live)
             results = live.results()
         if as_json:
             show_json(summary)
         elif results is not None:
-            _tell(results.report.to_dict()["regions"], summary, out)
+            tell(results.report.to_dict()["regions"], summary, out)
 
 
-def _play(session: LiveSession, quiet: bool) -> None:
+def play(session: LiveSession, quiet: bool) -> None:
     """Run the session to its end."""
     session.start()
     with scan_progress("replaying", quiet) as progress:
@@ -103,7 +103,8 @@ def _facts(session: LiveSession) -> dict[str, Any]:
     return {name: getattr(status, name) for name in ("lines", "points_per_s", "coverage", "progress", "losses")}
 
 
-def _tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
+def tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
+    """Print the regions as a table, and what the scan came to."""
     console.print(regions_table(regions, "Rescan regions"))
     share = summary["coverage"]["share"]
     console.print(

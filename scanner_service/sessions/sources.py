@@ -23,10 +23,12 @@ from drivers.protocols.scanner_events import (
     PassResumed,
     Rebooted,
     Reconnected,
+    ScannerEvent,
 )
 from drivers.rig import Rig
 from drivers.scanline import DeviceInfo, Float64Array, Profile, Scanline, SensorGeometry
-from drivers.scanners.native import Happening, NativeScanner
+from drivers.scanners.face import Happening
+from drivers.scanners.native import NativeScanner
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.storage.errors import RecordError
@@ -151,24 +153,31 @@ class DeviceSource:
             case Profile():
                 self._position_mm = event.position_mm
                 sink.line(self._rig.place(event))
-            case Disconnected(reason=reason):
-                sink.note("interrupted", {"reason": reason})
-            case OtherDevice(expected_id=expected, found_id=found):
-                sink.note("interrupted", {"reason": f"on its port scanner {found} answers instead of {expected}"})
-            case Reconnected(gap_s=gap_s, streaming=streaming):
-                sink.note("reconnected", {"gap_s": gap_s, "streaming": streaming})
-                if streaming:
-                    sink.note("resumed", {})
-            case PassResumed(pass_index=pass_index, from_mm=from_mm):
-                sink.note("resumed", {"pass_index": pass_index, "from_mm": from_mm})
-            case PassNotResumed(reason=reason):
-                sink.note("not_resumed", {"reason": reason})
-            case Rebooted(old_boot_id=old, new_boot_id=new):
-                sink.note("rebooted", {"old_boot_id": old, "new_boot_id": new})
             case PassEnded(pass_index=pass_index, reason=reason):
                 sink.note("pass_ended", {"pass_index": pass_index, "reason": reason})
                 return reason in ("reached_end", "stopped", "fault")
+            case _:
+                tell_scanner_event(event, sink)
         return False
+
+
+def tell_scanner_event(event: ScannerEvent, sink: Sink) -> None:
+    """Tell the sink what happened to a scanner, but for the end of its pass."""
+    match event:
+        case Disconnected(reason=reason):
+            sink.note("interrupted", {"reason": reason})
+        case OtherDevice(expected_id=expected, found_id=found):
+            sink.note("interrupted", {"reason": f"on its port scanner {found} answers instead of {expected}"})
+        case Reconnected(gap_s=gap_s, streaming=streaming):
+            sink.note("reconnected", {"gap_s": gap_s, "streaming": streaming})
+            if streaming:
+                sink.note("resumed", {})
+        case PassResumed(pass_index=pass_index, from_mm=from_mm):
+            sink.note("resumed", {"pass_index": pass_index, "from_mm": from_mm})
+        case PassNotResumed(reason=reason):
+            sink.note("not_resumed", {"reason": reason})
+        case Rebooted(old_boot_id=old, new_boot_id=new):
+            sink.note("rebooted", {"old_boot_id": old, "new_boot_id": new})
 
 
 class ReplaySource:

@@ -9,12 +9,12 @@ from starlette.responses import Response
 
 from scanner_service.api.answers import answer
 from scanner_service.api.keys import Role
-from scanner_service.api.schemas import DeviceSourceIn, PassIn, PushSourceIn, ReplaySourceIn, SessionIn
+from scanner_service.api.schemas import DeviceSourceIn, PassIn, PushSourceIn, ReplaySourceIn, RigSourceIn, SessionIn
 from scanner_service.api.scopes import require
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.session import LiveSession
-from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, ReplaySpec, SourceSpec
+from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, ReplaySpec, RigSpec, SourceSpec
 from scanner_service.storage.formats.recording import ReadOptions
 from scanner_service.storage.rows import SessionRow
 
@@ -36,11 +36,16 @@ async def session_of(request: Request, session_id: str) -> LiveSession:
 Session = Annotated[LiveSession, Depends(session_of)]
 
 
-def spec_of(source: DeviceSourceIn | ReplaySourceIn | PushSourceIn, replay_dir: Path) -> SourceSpec:
+def spec_of(source: DeviceSourceIn | RigSourceIn | ReplaySourceIn | PushSourceIn, replay_dir: Path) -> SourceSpec:
     """What the request asks to read from."""
     match source:
         case DeviceSourceIn():
             return DeviceSpec(**source.model_dump(exclude={"kind"}))
+        case RigSourceIn():
+            rigs_dir = replay_dir.parent / "rigs"
+            if not rigs_dir.is_dir() or source.rig not in {item.name for item in rigs_dir.iterdir()}:
+                raise SourceUnusable(f"there is no file {source.rig} in the service's folder of rigs")
+            return RigSpec(rigs_dir / source.rig, **source.model_dump(exclude={"kind", "rig"}))
         case ReplaySourceIn():
             if source.file not in {item.name for item in replay_dir.iterdir()}:
                 raise SourceUnusable(f"there is no file {source.file} in the service's replay folder")

@@ -12,13 +12,14 @@ from scanner_service.storage.formats.errors import (
     FormatUnknown,
     NoScanlines,
 )
+from scanner_service.storage.formats.joescan import is_joescan, read_joescan
 from scanner_service.storage.formats.ply import cloud_of, read_vertices
 from scanner_service.storage.formats.ply_header import is_ply
 from scanner_service.storage.formats.range_grid import recording_of_grid
 from scanner_service.storage.formats.recording import Cloud, ReadOptions, Recording
 from scanner_service.storage.formats.xyz import names_of_line, read_xyz
 
-Kind = Literal["ply", "csv profiles", "xyz", "record"]
+Kind = Literal["ply", "joescan", "csv profiles", "xyz", "record"]
 _HEAD_BYTES = 1 << 16
 
 
@@ -39,6 +40,8 @@ def open_recording(path: Path, options: ReadOptions | None = None) -> Recording:
         return recording_of_grid(vertices, path.name, options)
     if kind == "csv profiles":
         return read_csv_recording(_text(data, path.name), path.name, options)
+    if kind == "joescan":
+        return read_joescan(data, path.name, options)
     if kind == "xyz":
         raise NoScanlines(f"{path.name} is a plain cloud without scanlines; analyse it as a cloud")
     raise _is_a_record(path.name)
@@ -60,6 +63,8 @@ def open_cloud(path: Path, options: ReadOptions | None = None) -> Cloud:
         return read_csv_cloud(_text(data, path.name), path.name, options)
     if kind == "xyz":
         return read_xyz(data, path.name, options.units)
+    if kind == "joescan":
+        raise FormatUnknown(f"{path.name} is a recording of profiles with an encoder, not a cloud; replay it")
     raise _is_a_record(path.name)
 
 
@@ -75,6 +80,8 @@ def kind_of_content(head: bytes, name: str) -> Kind:
         return "record"
     if is_ply(head):
         return "ply"
+    if is_joescan(head):
+        return "joescan"
     if not head.strip():
         raise FileEmpty(f"{name} is empty: there is nothing to read")
     unknown = FormatUnknown(
