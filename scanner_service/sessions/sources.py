@@ -16,6 +16,8 @@ import numpy as np
 
 from drivers.errors import DriverError
 from drivers.protocols.scanner_events import (
+    Advice,
+    ClockJumped,
     Disconnected,
     OtherDevice,
     PassEnded,
@@ -43,7 +45,8 @@ class Sink(Protocol):
         """A scanline, or one out of a record; waits while the session is busy."""
 
     def note(self, kind: str, details: dict[str, Any]) -> None:
-        """Something happened: `interrupted`, `reconnected`, `resumed`, `not_resumed`, `rebooted`, `pass_ended`."""
+        """Something happened: `interrupted`, `reconnected`, `resumed`, `not_resumed`, `rebooted`,
+        `clock_jumped`, `advice`, `pass_ended`."""
 
     def ended(self, failure: str | None) -> None:
         """Nothing more will come; `failure` says why when that was not planned."""
@@ -178,6 +181,10 @@ def tell_scanner_event(event: ScannerEvent, sink: Sink) -> None:
             sink.note("not_resumed", {"reason": reason})
         case Rebooted(old_boot_id=old, new_boot_id=new):
             sink.note("rebooted", {"old_boot_id": old, "new_boot_id": new})
+        case ClockJumped(count=count):
+            sink.note("clock_jumped", {"count": count})
+        case Advice(text=text):
+            sink.note("advice", {"text": text})
 
 
 class ReplaySource:

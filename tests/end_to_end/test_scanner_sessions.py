@@ -2,8 +2,6 @@
 
 import pytest
 
-pytest.importorskip("scanner_service.sessions.rig_source", reason="this build has no rigs")
-
 RIG = """
 name = "conveyor"
 
