@@ -9,6 +9,7 @@ import typer
 from scanner_service import __version__
 from scanner_service.commands.analyse import analyse_command
 from scanner_service.commands.bench import bench_app
+from scanner_service.commands.compare import compare_command
 from scanner_service.commands.demo import demo_command
 from scanner_service.commands.open_viewer import open_command
 from scanner_service.commands.replay import replay_command
@@ -27,6 +28,7 @@ app.command("open")(open_command)
 app.command("demo")(demo_command)
 app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)
+app.command("compare")(compare_command)
 app.command("simulate")(simulate_command)
 app.add_typer(bench_app, name="bench")
 

@@ -71,9 +71,18 @@ def analyse_by_method(
     if method not in METHOD_NAMES:
         raise MethodUnknown(f"there is no method {method}; the methods are {', '.join(METHOD_NAMES)}")
     points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 3)
+    check_options(method, options)
     answer = _quadrics(points, method, options, tell) if method in QUADRICS else _normals(points, method, options, tell)
     towards = np.array([0.0, 0.0, 1.0]) if towards_mm is None else towards_mm - points
     return _turned(answer, towards, towards_mm is None)
+
+
+def check_options(method: str, options: NormalOptions) -> None:
+    """Raise MethodRefused when an option is stated that a method of METHOD_NAMES does not read."""
+    if method in METHODS:
+        METHODS[method].check(options)
+    elif options.given() - {"radius_mm"}:
+        raise MethodRefused(f"{method} takes radius_mm alone: leave the other options out")
 
 
 def _normals(points: Float64Array, method: str, options: NormalOptions, tell: Tell) -> MethodAnswer:
@@ -85,9 +94,6 @@ def _normals(points: Float64Array, method: str, options: NormalOptions, tell: Te
 
 
 def _quadrics(points: Float64Array, method: str, options: NormalOptions, tell: Tell) -> MethodAnswer:
-    foreign = sorted(options.given() - {"radius_mm"})
-    if foreign:
-        raise MethodRefused(f"{method} does not read {', '.join(foreign)}; it takes radius_mm")
     kind = QUADRICS[method]
     needed = NEEDED[kind]
     if int(np.isfinite(points).all(axis=1).sum()) < needed + SPARE_POINTS:

@@ -31,7 +31,7 @@ LARGEST_STEP = 1.5
 """A round reaches for at most this multiple of its radius: a flat place must not leap over the edges around it."""
 
 ROUNDS = 60
-_NOISE_NEIGHBOURS = 30
+_NOISE_NEIGHBOURS = (30, 100)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +101,14 @@ def mitra_radius_mm(
 def estimate_noise_mm(points_mm: Float64Array) -> float:
     """Standard deviation in mm of the points (n, 3) across their surface: the median residual of bivariate fits.
 
-    Over a repeatable sample, each fit over as many neighbours as suit the cloud (`choose_count`), at least 30. NaN for
-    clouds too small for that.
+    Over a repeatable sample, each fit over as many neighbours as suit the cloud (`choose_count`), from 30 to 100. NaN
+    for clouds too small for that.
     """
     n = len(points_mm)
-    if n < _NOISE_NEIGHBOURS:
+    least, most = _NOISE_NEIGHBOURS
+    if n < least:
         return math.nan
-    count = max(choose_count(points_mm), _NOISE_NEIGHBOURS)
+    count = min(max(choose_count(points_mm), least), most)
     sample = np.argsort(mixed(np.arange(n, dtype=np.uint64)), kind="stable")[:SAMPLE]
     residual = []
     for some in by_number(cKDTree(points_mm), points_mm, sample, count):

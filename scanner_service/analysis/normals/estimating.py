@@ -41,6 +41,13 @@ class NormalMethod:
     reads: frozenset[str]
     estimate: Estimate
 
+    def check(self, options: NormalOptions) -> None:
+        """Raise MethodRefused when an option is stated that the method does not read."""
+        foreign = sorted(options.given() - self.reads)
+        if foreign:
+            takes = ", ".join(sorted(self.reads)) or "no options"
+            raise MethodRefused(f"{self.name} does not read {', '.join(foreign)}; it takes {takes}")
+
 
 def _method(name: str, summary: str, reads: tuple[str, ...], estimate: Estimate) -> tuple[str, NormalMethod]:
     return name, NormalMethod(name, summary, frozenset(reads), estimate)
@@ -86,10 +93,7 @@ def estimate_normals(
     if method not in METHODS:
         raise MethodUnknown(f"there is no method {method}; the methods are {', '.join(METHODS)}")
     chosen = METHODS[method]
-    foreign = sorted(options.given() - chosen.reads)
-    if foreign:
-        takes = ", ".join(sorted(chosen.reads)) or "no options"
-        raise MethodRefused(f"{method} does not read {', '.join(foreign)}; it takes {takes}")
+    chosen.check(options)
     points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 3)
     finite: BoolArray = np.asarray(np.isfinite(points).all(axis=1))
     count = int(finite.sum())
