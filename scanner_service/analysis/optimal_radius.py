@@ -124,12 +124,14 @@ def optimal_radius(
     noise_mm: float | None = None,
     law: RadiusLaw | None = None,
     tell: Tell = tell_nobody,
+    rows: Int64Array | None = None,
 ) -> OptimalRadius:
     """Iterate Eq. 6.2 for every point (n, 3), finite, from its FIRST_NEIGHBOURS nearest on.
 
     The first round takes κ = 2d/μ², d being the distance of the point to the plane of its neighbours and μ their mean
     distance. Under noise that is far too large, so from then on κ is that of the bivariate quadratic within the
-    radius of the round, lessened by what noise alone would feign. Each step goes only `damping` of the way.
+    radius of the round, lessened by what noise alone would feign. Each step goes only `damping` of the way. `rows` (m,)
+    asks for some of the points only.
 
     Raises
     ------
@@ -142,11 +144,15 @@ def optimal_radius(
     noise = estimate_noise_mm(points_mm) if noise_mm is None else noise_mm
     if not math.isfinite(noise):
         noise = 0.0
-    radius, density, curvature = np.empty(n), np.empty(n), np.empty(n)
-    count = np.empty(n, dtype=np.int64)
-    bound = np.empty(n, dtype=np.int64)
-    for some in by_number(cKDTree(points_mm), points_mm, np.arange(n), law.max_neighbours):
-        part = slice(int(some.at[0]), int(some.at[-1]) + 1)
+    asked = np.arange(n) if rows is None else rows
+    m = len(asked)
+    radius, density, curvature = np.empty(m), np.empty(m), np.empty(m)
+    count = np.empty(m, dtype=np.int64)
+    bound = np.empty(m, dtype=np.int64)
+    done = 0
+    for some in by_number(cKDTree(points_mm), points_mm, asked, law.max_neighbours):
+        part = slice(done, done + len(some.at))
+        done = part.stop
         _iterate(
             points_mm,
             some.at,
@@ -165,7 +171,7 @@ def optimal_radius(
             count[part],
             bound[part],
         )
-        tell(part.stop / n)
+        tell(done / m)
     return OptimalRadius(radius, density, curvature, count, bound < 0, bound > 0, noise)
 
 

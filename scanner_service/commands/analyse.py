@@ -49,7 +49,7 @@ def analyse_command(
 ) -> None:
     """Analyse a cloud with a given radius or one of the chapter's rules, and write the result files."""
     with plain_errors():
-        stated = {"neighbours": neighbours, "noise": noise, "floor": floor, "ceiling": ceiling}
+        stated: dict[str, object] = {"neighbours": neighbours, "noise": noise, "floor": floor, "ceiling": ceiling}
         stated |= {"ball-factor": ball_factor, "session": session}
         if method is not None:
             refuse({"rule": rule, "max-radius": max_radius, "density": density}, f"leave it out with --method {method}")

@@ -1,4 +1,4 @@
-"""Analyses that are asked for: one after the other on a thread of their own, bounded in number and size; knows no HTTP."""
+"""Analyses that are asked for: one after the other on a thread of its own, bounded; knows no HTTP."""
 
 import logging
 import queue
@@ -29,7 +29,7 @@ State = Literal["waiting", "running", "done", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class AnalysisPoints:
-    """What an analysis works on: points (n, 3) in mm, and where their normals are turned to, (3,), (n, 3) or unknown."""
+    """Points (n, 3) in mm to work on, and where their normals are turned to: (3,), (n, 3), or None for unknown."""
 
     points_mm: Float64Array
     towards_mm: Float64Array | None
@@ -220,9 +220,7 @@ class AnalysisBook:
     def _known(self, job_id: str) -> AnalysisJob:
         job = self._jobs.get(job_id)
         if job is None:
-            raise AnalysisUnknown(
-                f"there is no analysis {job_id[:40]}; results are kept until newer ones need their room"
-            )
+            raise AnalysisUnknown(f"there is no analysis {job_id[:40]}; newer ones may have needed its room")
         return job
 
     def _forget_old(self) -> None:

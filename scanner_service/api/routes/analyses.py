@@ -18,7 +18,7 @@ from scanner_service.api.errors import ValueUnusable
 from scanner_service.api.routes.results import PassingFile
 from scanner_service.api.routes.sessions import book_of, operator, viewer
 from scanner_service.api.schemas import AnalysisIn, FilePointsIn, SessionPointsIn
-from scanner_service.sessions.analyses import AnalysisBook, AnalysisJob, AnalysisPoints, AnalysisRequest
+from scanner_service.sessions.analyses import MAX_POINTS, AnalysisBook, AnalysisJob, AnalysisPoints, AnalysisRequest
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.storage.exports.method_ply import write_method_ply
@@ -140,6 +140,8 @@ def _session_points(book: SessionBook, source: SessionPointsIn) -> Callable[[], 
 
     def read() -> AnalysisPoints:
         session = book.get(source.session_id)
+        if session.engine.ledger.counted > MAX_POINTS:
+            raise ValueError(f"the session holds more than {MAX_POINTS:,} points: export it, and analyse a part")
         snapshot = session.engine.ask(lambda engine: engine.live_map.snapshot()).result()
         note = f"session {source.session_id}: normals are turned to the laser of each point's own scanline"
         return AnalysisPoints(snapshot.points_mm, snapshot.lines.laser_mm[snapshot.line], (note,))
