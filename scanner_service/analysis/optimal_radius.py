@@ -31,6 +31,9 @@ LARGEST_STEP = 1.5
 """A round reaches for at most this multiple of its radius: a flat place must not leap over the edges around it."""
 
 ROUNDS = 60
+ENOUGH = 100
+"""While a radius is sought, a curvature is fitted to about so many of its neighbours at most."""
+
 _NOISE_NEIGHBOURS = (30, 100)
 
 
@@ -288,6 +291,7 @@ def _curvature(
     variances: Float64Array,
 ) -> float:
     """The larger principal curvature within the radius, less what noise feigns; the one before if there is no fit."""
+    some = some[:: max(len(some) // ENOUGH, 1)]  # sorted by distance: every so manieth is spread over the whole radius
     if len(some) < 9 or not frame_at(points, row, some, frame):
         return before
     rms = fit_bivariate(points, row, some, radius, frame, coefficients, variances)

@@ -19,7 +19,7 @@ from scanner_service.analysis.optimal_radius import (
 )
 
 NAME = "adaptive_radius"
-SCALES = (1.0, 0.1, 4.0, 16.0, 64.0, 256.0, 1024.0, 4096.0)
+SCALES = (1.0, 0.1, 8.0, 64.0, 512.0, 4096.0)
 """What the constants of the formula are multiplied by, tried in this order; the first of equals is taken."""
 
 _REACHES = 1.0 + 1e-12
