@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from drivers.scanline import Float64Array
 from scanner_service.analysis.comparison.running import Contestant, Estimator
 
-COUNTS = (6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 250, 320, 400, 500, 700, 1000)
+COUNTS = (8, 10, 15, 20, 25, 30, 40, 60, 80, 120, 200, 320, 500)
 _AT_ONCE = 2_000_000
 
 

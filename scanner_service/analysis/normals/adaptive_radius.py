@@ -21,6 +21,7 @@ from scanner_service.analysis.optimal_radius import (
 NAME = "adaptive_radius"
 SCALES = (1.0, 0.1, 8.0, 64.0, 512.0, 4096.0)
 """What the constants of the formula are multiplied by, tried in this order; the first of equals is taken."""
+SCALE_SAMPLE = 500
 
 _REACHES = 1.0 + 1e-12
 
@@ -66,7 +67,7 @@ def choose_scale(points_mm: Float64Array, options: NormalOptions) -> float:
     smooth surfaces that costs a large part of what a larger radius would average away. The two halves of the cloud
     tell (`choose_count`).
     """
-    halves = Halves.deal(points_mm)
+    halves = Halves.deal(points_mm, SCALE_SAMPLE)
     if len(halves.ladder) < 2:
         return 1.0
     reference = halves.reference()

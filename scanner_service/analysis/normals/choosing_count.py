@@ -11,7 +11,7 @@ from scanner_service.analysis.normals.fitting import plane_fits
 from scanner_service.analysis.normals.neighbourhoods import Neighbourhoods, by_number
 from scanner_service.analysis.radius import mixed
 
-LADDER = (8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 250, 320, 400, 500, 700, MAX_NEIGHBOURS)
+LADDER = (8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 250, 320, 400, MAX_NEIGHBOURS)
 """Numbers of neighbours that are tried."""
 
 SAMPLE = 2000
@@ -60,11 +60,11 @@ class Halves:
     nearest: tuple[Int64Array, Int64Array]
 
     @classmethod
-    def deal(cls, points_mm: Float64Array) -> "Halves":
+    def deal(cls, points_mm: Float64Array, sample: int = SAMPLE) -> "Halves":
         """The same halves and sample of points (n, 3) every time."""
         key = mixed(np.arange(len(points_mm), dtype=np.uint64))
         in_first = (key & np.uint64(1)).astype(np.bool_)
-        rows = np.argsort(key, kind="stable")[:SAMPLE]
+        rows = np.argsort(key, kind="stable")[:sample]
         at_mm = points_mm[rows]
         halves = points_mm[in_first], points_mm[~in_first]
         return cls(rows, at_mm, halves, (_nearest(halves[0], at_mm), _nearest(halves[1], at_mm)))

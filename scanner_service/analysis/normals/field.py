@@ -23,7 +23,7 @@ def tell_nobody(share: float) -> None:
 MIN_NEIGHBOURS = 6
 """A plane needs at least this many points, the point itself counted, before its normal is given."""
 
-MAX_NEIGHBOURS = 1000
+MAX_NEIGHBOURS = 500
 """A neighbourhood that is chosen, and not stated, holds at most this many points."""
 
 
