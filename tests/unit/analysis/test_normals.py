@@ -25,7 +25,7 @@ def test_normals_of_a_sphere_without_noise_are_right_and_do_not_depend_on_where_
     here = estimate_normals(points, method, EVERYTHING)
     assert rms_deg(here.normals, truth) < 3.0
     np.testing.assert_allclose(np.linalg.norm(here.normals, axis=1), 1.0, atol=1e-12)
-    there = estimate_normals(points + [4096.0, -512.0, 64.0], method, EVERYTHING)
+    there = estimate_normals(points + np.array([4096.0, -512.0, 64.0]), method, EVERYTHING)
     assert np.median(angle_deg(here.normals, there.normals)) < 1e-4
 
 
@@ -206,7 +206,7 @@ def test_unknown_methods_and_options_of_other_methods_are_refused():
     ],
 )
 def test_options_that_cannot_be_meant_are_refused(wrong):
-    with pytest.raises(ValueError, match="must|needs|leave|above"):
+    with pytest.raises(ValueError, match=r"must|needs|leave|above"):
         NormalOptions(**wrong)
 
 
