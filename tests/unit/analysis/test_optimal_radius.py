@@ -38,7 +38,7 @@ def test_no_noise_asks_for_no_radius_and_no_curvature_for_all_of_it():
     assert mitra_radius_mm(np.array([0.0]), np.array([10.0]), 0.1).tolist() == [math.inf]
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.05, 0.1])
+@pytest.mark.parametrize("noise", [0.02, 0.1])
 @pytest.mark.parametrize("shape", ["sphere", "cylinder"])
 def test_noise_and_density_are_found_again(shape, noise):
     rng = np.random.default_rng(1)
@@ -63,10 +63,10 @@ def test_curvature_is_found_again_within_a_fifth(shape, truth):
 
 def test_more_noise_and_less_curvature_make_larger_radii():
     rng = np.random.default_rng(3)
-    small, _ = sphere(4000, 5.0, rng, 0.1)
+    small, _ = sphere(1500, 5.0, rng, 0.1)
     quiet, loud = (optimal_radius(small, noise, RadiusLaw(c1=10, c2=40)) for noise in (0.02, 0.2))
     assert np.median(loud.radius_mm) > 1.2 * np.median(quiet.radius_mm)
-    flat, _ = tilted_plane(4000, math.sqrt(4 * math.pi * 25), rng, 0.1)
+    flat, _ = tilted_plane(1500, math.sqrt(4 * math.pi * 25), rng, 0.1)
     level = optimal_radius(flat, 0.1, RadiusLaw(c1=10, c2=40))
     assert np.median(level.radius_mm) > 1.2 * np.median(optimal_radius(small, 0.1, RadiusLaw(c1=10, c2=40)).radius_mm)
 

@@ -86,14 +86,25 @@ def test_a_cylinder_bends_around_and_not_along(kind):
     assert (np.sign(curvature[rows, bent]) == -outwards).mean() > 0.999  # positive bends towards the normal
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_distance_of_a_point_off_the_surface_is_measured(kind):
-    points, truth = sphere(20_000, 10.0, np.random.default_rng(4))
-    points = np.vstack([points, 10.25 * truth[:20]])
-    found = local_quadrics(points, kind, radius_mm=np.full(len(points), 1.5))
-    # the fit is least squares, so the one point off the surface draws it towards itself by about 2 of 100 parts
-    np.testing.assert_allclose(found.distance_mm[-20:], 0.25, rtol=0.12)
-    assert np.median(found.distance_mm[:-20]) < 2e-3
+def test_the_distance_of_a_point_off_the_surface_is_measured():
+    points, truth = sphere(4000, 10.0, np.random.default_rng(4))
+    points = np.vstack([points, 10.25 * truth[:5]])
+    found = local_quadrics(points, "bivariate", radius_mm=np.full(len(points), 3.0))
+    # the fit is least squares, so the one point off the surface draws it a little towards itself
+    np.testing.assert_allclose(found.distance_mm[-5:], 0.25, rtol=0.12)
+    assert np.median(found.distance_mm[:-5]) < 5e-3
+
+
+def test_feet_on_a_general_quadric_are_nearest():
+    """A sphere of radius 3 around the origin: x² + y² + z² - 9 = 0; inside and outside."""
+    equation = np.array([-9.0, 0, 0, 0, 1, 0, 0, 1, 0, 1])
+    at = np.random.default_rng(5).normal(size=(50, 3))
+    at *= np.linspace(1.5, 6.0, 50)[:, None] / np.linalg.norm(at, axis=1, keepdims=True)
+    foot = general.feet(np.tile(equation, (50, 1)), at)
+    np.testing.assert_allclose(foot, 3.0 * at / np.linalg.norm(at, axis=1, keepdims=True), atol=1e-9)
+    curvature, _, normals = general.curvatures(np.tile(equation, (50, 1)), foot)
+    np.testing.assert_allclose(curvature, -1.0 / 3.0, atol=1e-9)  # bends away from the outward normal
+    np.testing.assert_allclose(normals, foot / 3.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
