@@ -21,7 +21,7 @@ def comparison_png(rows: Sequence[Row], *, dpi: int = 110) -> bytes:
     clouds = list(dict.fromkeys(row.cloud for row in rows))
     methods = list(dict.fromkeys(row.method for row in rows))
     panels = len(clouds) + 1
-    columns = min(_COLUMNS, panels)
+    columns = 2 if panels in (2, 4) else _COLUMNS
     deep = math.ceil(panels / columns)
     figure = Figure(figsize=(5.2 * columns, 4.1 * deep + 0.9), dpi=dpi, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
@@ -55,6 +55,7 @@ def _errors(panel: Axes, cloud: str, rows: Sequence[Row], methods: Sequence[str]
     panel.set_ylabel("rms error, degrees (log scale)")
     panel.set_yscale("log")
     panel.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    panel.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:g}"[0] in "235" else "")
     panel.grid(True, which="both", color="#e4e4e4", linewidth=0.6)
     panel.set_axisbelow(True)
 
