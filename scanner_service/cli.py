@@ -9,6 +9,7 @@ import typer
 from scanner_service import __version__
 from scanner_service.commands.analyse import analyse_command
 from scanner_service.commands.bench import bench_app
+from scanner_service.commands.compare import compare_command
 from scanner_service.commands.demo import demo_command
 from scanner_service.commands.devices import devices_command, doctor_command
 from scanner_service.commands.open_viewer import open_command
@@ -32,6 +33,7 @@ app.command("devices")(devices_command)
 app.command("doctor")(doctor_command)
 app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)
+app.command("compare")(compare_command)
 app.command("simulate")(simulate_command)
 app.add_typer(bench_app, name="bench")
 

@@ -7,7 +7,7 @@ from starlette.types import ASGIApp
 
 from drivers.errors import DriverError, PortAbsent, PortBusy, PortNotPermitted
 from scanner_service import __version__, web
-from scanner_service.analysis.errors import MapFull, TooManyPasses
+from scanner_service.analysis.errors import MapFull, MethodRefused, MethodUnknown, TooManyPasses
 from scanner_service.api.access import ACCESS_PROBLEMS
 from scanner_service.api.docs_page import install_docs
 from scanner_service.api.errors import ExportUnknown, ValueUnusable
@@ -15,11 +15,20 @@ from scanner_service.api.guard import Guard, GuardRules
 from scanner_service.api.login import login_router
 from scanner_service.api.origins import Allowlist
 from scanner_service.api.problems import Problem, ProblemTable, register_problems
-from scanner_service.api.routes import health, live, results, scanlines, sessions
+from scanner_service.api.routes import analyses, health, live, results, scanlines, sessions
 from scanner_service.api.scopes import Scoped, check_every_route_declares_a_scope, public
 from scanner_service.api.service import Service
 from scanner_service.rescan.requirement import RequirementUnusable
-from scanner_service.sessions.errors import LineRefused, SessionBusy, SessionError, SessionNotLive, SourceUnusable
+from scanner_service.sessions.errors import (
+    AnalysesBusy,
+    AnalysisNotDone,
+    AnalysisUnknown,
+    LineRefused,
+    SessionBusy,
+    SessionError,
+    SessionNotLive,
+    SourceUnusable,
+)
 from scanner_service.storage.errors import RecordBusy, RecordError, SessionUnknown
 from scanner_service.storage.exports.errors import ExportError
 from scanner_service.storage.formats.errors import FormatError
@@ -38,6 +47,11 @@ SESSION_PROBLEMS: ProblemTable = {
     DriverError: Problem(502, "scanner-error", "The scanner does not do its part"),
     TooManyPasses: Problem(409, "too-many-passes", "Too many passes are open"),
     TimeoutError: Problem(503, "record-slow", "The disk does not answer"),
+    AnalysisUnknown: Problem(404, "analysis-unknown", "There is no such analysis"),
+    AnalysisNotDone: Problem(409, "analysis-not-done", "The analysis has no result"),
+    AnalysesBusy: Problem(503, "analyses-busy", "Too many analyses are waiting"),
+    MethodUnknown: Problem(422, "method-unknown", "There is no such method"),
+    MethodRefused: Problem(422, "method-refused", "The method cannot do that"),
     MapFull: Problem(507, "map-full", "The live map is full"),
     RecordBusy: Problem(503, "record-busy", "The record cannot take more now"),
     RecordError: Problem(500, "record-error", "The record failed"),
@@ -61,7 +75,7 @@ def make_app(service: Service, allowlist: Allowlist | None = None) -> ASGIApp:
     register_problems(app, problems)
     install_docs(app, problems.values())
     app.include_router(login_router())
-    for module in (health, sessions, scanlines, results, live):
+    for module in (health, sessions, scanlines, results, live, analyses):
         app.include_router(module.router)
 
     @app.get("/", dependencies=[Depends(public)], include_in_schema=False)

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from drivers.scanline import Float64Array, Scanline
+from scanner_service.analysis.normals.field import NormalOptions
 from scanner_service.analysis.radius import LiveRule
 from scanner_service.sessions.settings import SessionSettings
 
@@ -132,6 +133,50 @@ class ScanlineIn(_Strict):
             line_spacing_mm=self.line_spacing_mm,
             step_mm=math.nan if self.step_mm is None else self.step_mm,
         )
+
+
+class SessionPointsIn(_Strict):
+    """The points of a session, each normal turned to the laser of its own scanline."""
+
+    kind: Literal["session"]
+    session_id: Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[0-9a-z]+$", examples=["1m82614ch5ada4"])]
+
+
+class FilePointsIn(_Strict):
+    """A cloud that lies in the service's replay folder; `file` is its bare name."""
+
+    kind: Literal["file"]
+    file: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00]+$", examples=["part.ply"])]
+    units: Literal["mm", "m", "inch", "auto"] | None = None
+    seen_from_mm: Vector | None = None
+
+
+Length = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
+
+
+class MethodOptionsIn(_Strict):
+    """What a method is told; each reads its own, and what is left out it chooses itself."""
+
+    radius_mm: Length | None = None
+    neighbours: Annotated[int, Field(ge=6, le=5000)] | None = None
+    noise_mm: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = None
+    floor_mm: Length | None = None
+    ceiling_mm: Length | None = None
+    ball_factor: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = None
+    max_error_deg: Annotated[float, Field(gt=0, le=90, allow_inf_nan=False)] = 5.0
+
+    def to_options(self) -> NormalOptions:
+        """As the methods take them; raises ValueError where two do not go together."""
+        values = self.model_dump()
+        return NormalOptions(max_error_rad=math.radians(values.pop("max_error_deg")), **values)
+
+
+class AnalysisIn(_Strict):
+    """A method, and the points it is to work on."""
+
+    method: Annotated[str, Field(min_length=1, max_length=60, examples=["gaussian", "bivariate_quadric"])]
+    source: Annotated[SessionPointsIn | FilePointsIn, Field(discriminator="kind")]
+    options: MethodOptionsIn = MethodOptionsIn()
 
 
 class PassIn(_Strict):

@@ -3,13 +3,14 @@
 import secrets
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from prometheus_client import CollectorRegistry
 
 from scanner_service.api.access import Access
 from scanner_service.api.metrics import metrics_of
+from scanner_service.sessions.analyses import AnalysisBook
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.readiness import kernels_are_ready, warm_up
 from scanner_service.storage.record import Record
@@ -23,6 +24,7 @@ class Service:
     access: Access
     replay_dir: Path
     metrics: CollectorRegistry
+    analyses: AnalysisBook = field(default_factory=AnalysisBook)
 
     @property
     def kernels_ready(self) -> bool:
@@ -50,6 +52,7 @@ class Service:
 
     def close(self) -> None:
         """Stop the sessions, write what waits, let go of the record."""
+        self.analyses.close()
         try:
             self.book.close()
         finally:

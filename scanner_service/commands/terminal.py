@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from drivers.errors import DriverError
+from scanner_service.analysis.errors import AnalysisError
 from scanner_service.api.answers import plain
 from scanner_service.api.keys import KeyStoreError
 from scanner_service.api.server import ServerError
@@ -28,6 +29,7 @@ console = Console(markup=False)  # what is told may hold brackets: paths, names,
 errors = Console(stderr=True, markup=False)
 EXPECTED = (
     httpx.HTTPError,
+    AnalysisError,
     DriverError,
     KeyStoreError,
     ServerError,

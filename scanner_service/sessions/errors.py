@@ -4,7 +4,10 @@ SessionError
 ├── SessionNotLive      the session is in the record, but not open
 ├── SessionBusy         the request does not fit the session's state
 ├── SourceUnusable      what the session should read from cannot be read
-└── LineRefused         one scanline was not taken in, for the reason told
+├── LineRefused         one scanline was not taken in, for the reason told
+├── AnalysisUnknown     there is no analysis of that id, or its room was needed
+├── AnalysisNotDone     the analysis has no result: it waits, runs or has failed
+└── AnalysesBusy        as many analyses as may wait are waiting
 """
 
 
@@ -30,3 +33,15 @@ class LineRefused(SessionError):
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
         self.reason = reason
+
+
+class AnalysisUnknown(SessionError):
+    """There is no analysis of that id, or its room was needed."""
+
+
+class AnalysisNotDone(SessionError):
+    """The analysis has no result: it waits, runs or has failed."""
+
+
+class AnalysesBusy(SessionError):
+    """As many analyses as may wait are waiting."""

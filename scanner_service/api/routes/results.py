@@ -123,14 +123,14 @@ def export(session: Session, file_name: str) -> Response:
     except BaseException:
         shutil.rmtree(folder)
         raise
-    return _PassingFile(
+    return PassingFile(
         folder / file_name,
         media_type=MEDIA_TYPES[Path(file_name).suffix],
         filename=f"{session.row.session_id}-{file_name}",
     )
 
 
-class _PassingFile(FileResponse):
+class PassingFile(FileResponse):
     """A file whose folder is removed after the answer, whatever that was: a background task is not run for each."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
