@@ -10,7 +10,6 @@ import logging
 import os
 import sys
 import time
-from dataclasses import asdict
 from typing import Any
 
 from tests.faults import sqlite_disk
@@ -59,7 +58,7 @@ def main() -> int:
             account = inject(chosen, progress)
         case "flips":
             account = flip_bits(given.flips, given.seed, progress)
-    told = asdict(account)
+    told = dict(vars(account))
     took_s = round(time.monotonic() - begun_s, 1)
     print(json.dumps({"harness": given.what, "seed": given.seed, "took_s": took_s, "load": os.getloadavg()[0], **told}))
     return int(any(told.get(kind, 0) for kind in _BAD))
