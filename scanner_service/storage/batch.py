@@ -144,9 +144,8 @@ class Batch:
 
     def describe(self, session_id: str, name: str | None, text: str | None, now_utc: str) -> SessionRow:
         """Change a session's name or notes."""
-        row = self._sound_session(session_id)
-        if name is not None:
-            row = self._update(session_id, row, {"name": name, "changed_utc": now_utc})
+        changes = {"changed_utc": now_utc} | ({} if name is None else {"name": name})
+        row = self._update(session_id, self._sound_session(session_id), changes)
         kept = self._connection.execute(select(notes).where(notes.c.session_id == session_id)).first()
         before = kept._asdict() if kept is not None else _notes_row(session_id, "", {})
         if text is not None:

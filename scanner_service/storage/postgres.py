@@ -66,13 +66,16 @@ class PostgresSchema:
     def of_reader(cls, address: str) -> "PostgresSchema":
         """A record to be read beside a service that may be writing it; raises NotARecord, RecordTooNew."""
         opened = cls(_url(address))
+        engine = opened.reader_engine()
         try:
-            with opened.reader_engine().connect() as connection:
+            with engine.connect() as connection:
                 if not inspect(connection).has_table(record.name):
                     raise NotARecord(f"there is no record at {opened.name}")
                 _check_identity(connection, opened.name)
         except DBAPIError as error:
             raise NotARecord(f"the record {opened.name} cannot be read: {first_line(error)}") from error
+        finally:
+            engine.dispose()
         return opened
 
     def writer_engine(self) -> Engine:
@@ -111,6 +114,7 @@ class PostgresSchema:
                 "SELECT min(pid) FROM pg_locks WHERE locktype = 'advisory' AND classid = %s AND granted",
                 (APPLICATION_ID,),
             ).fetchone()[0]
+            raw.close()
             raise RecordInUse(
                 f"the record {self.name} is in use by another service (server process {holder}); "
                 "stop it, or choose another record"
