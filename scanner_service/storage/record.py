@@ -245,9 +245,13 @@ class Record:
 
     def set_state(self, session_id: str, state: str) -> SessionRow:
         """Change a session's state; raises SessionUnknown, SessionDamaged and what `create_session` does."""
+        return self.change_state(session_id, state, _PATIENCE_S).result(_PATIENCE_S)
+
+    def change_state(self, session_id: str, state: str, timeout_s: float = 0.0) -> "Future[SessionRow]":
+        """Queue a change of a session's state; the future has its answer when the change is durable."""
         plain_text(state, "state")
         now = self._now()
-        return self._wait_for(lambda batch: batch.set_state(session_id, state, now))
+        return self._writer.submit(lambda batch: batch.set_state(session_id, state, now), _ROW_BYTES, timeout_s)
 
     def describe(self, session_id: str, *, name: str | None = None, notes: str | None = None) -> SessionRow:
         """Change the name or the notes of a session, None leaves them; raises what `set_state` does, NotStorable."""
