@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 
 from scanner_service.sessions.calibration import calibration_of, geometry_from, towards_sensor_from
-from scanner_service.sessions.errors import BudgetSpent, SessionBusy
+from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SessionError
 from scanner_service.sessions.retention import OVER, Kept, Retention, choose
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
@@ -52,6 +52,7 @@ class SessionBook:
         self._live: dict[str, LiveSession] = {}
         self._opening: dict[str, Opening] = {}
         self._creating: set[str] = set()
+        self._failures: dict[str, str] = {}
         self._lock = threading.RLock()
         for row in self._all_rows():
             if row.state in ("scanning", "paused"):  # the service ended in the middle of it
@@ -173,6 +174,18 @@ class SessionBook:
         with self._lock:
             self._live[row.session_id] = session
         return session
+
+    def open_quietly(self, session_id: str) -> None:
+        """Reopen a session; what keeps it from being opened is told by `failure_to_open`."""
+        self._failures.pop(session_id, None)
+        try:
+            self.get(session_id)
+        except (SessionError, RecordError) as error:
+            self._failures[session_id] = str(error)
+
+    def failure_to_open(self, session_id: str) -> str | None:
+        """Why the session could not be reopened when that was last tried; None when it could."""
+        return self._failures.get(session_id)
 
     def opening(self, session_id: str) -> Opening | None:
         """How far a session is that is being reopened; None when it is not."""

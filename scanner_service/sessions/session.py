@@ -191,6 +191,11 @@ class LiveSession:
         self._judge()
         return count
 
+    @property
+    def can_pause(self) -> bool:
+        """True for a source that can be held and go on."""
+        return isinstance(self.source, Pausable)
+
     def pause(self) -> None:
         """Hold the scan until `resume`: stage and laser of a device stop.
 
