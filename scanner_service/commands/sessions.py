@@ -102,30 +102,27 @@ def show_command(
 
 
 def ledger_table(passes: list[dict[str, Any]]) -> Table:
-    """The ledger as people read it: a row a pass; each row adds up."""
-    table = Table(title="Ledger: sent = stored + under way + lost", title_justify="left")
-    table.add_column("device")
-    for name in ("boot", "pass", "lines sent", "stored", "of them partial", "under way", "lost"):
+    """The ledger as people read it: a row a pass, each of which adds up; reasons below each other."""
+    table = Table(title="Ledger, scanlines: sent = stored + under way + lost", title_justify="left")
+    table.add_column("pass", no_wrap=True)
+    for name in ("sent", "stored", "partial", "under way", "lost", "chunks lost"):
         table.add_column(name, justify="right")
-    table.add_column("reasons")
-    for name in ("chunks sent", "stored", "lost"):
-        table.add_column(name, justify="right")
+    boots = {(account["device_id"], account["boot_id"]) for account in passes}
+    devices = {device for device, _ in boots}
     for account in passes:
         lines, chunks = account["lines"], account["chunks"]
-        reasons = ", ".join(f"{reason.replace('_', ' ')} {count:,}" for reason, count in lines["lost"].items())
-        in_chunks = ["–"] * 3
-        if chunks is not None:
-            in_chunks = [f"{count:,}" for count in (chunks["sent"], chunks["stored"], sum(chunks["lost"].values()))]
-        table.add_row(
-            account["device_id"],
-            str(account["boot_id"]),
-            str(account["pass_index"]),
-            *(f"{lines[name]:,}" for name in ("sent", "stored", "partial", "under_way")),
-            f"{sum(lines['lost'].values()):,}",
-            reasons or "–",
-            *in_chunks,
-        )
+        name = f"{account['device_id']}  {account['pass_index']}"
+        if len(boots) > len(devices):
+            name += f"\n  boot {account['boot_id']}"
+        lost_chunks = "–" if chunks is None else _with_reasons(chunks["lost"], f" of {chunks['sent']:,}")
+        counts = (f"{lines[kind]:,}" for kind in ("sent", "stored", "partial", "under_way"))
+        table.add_row(name, *counts, _with_reasons(lines["lost"]), lost_chunks)
     return table
+
+
+def _with_reasons(lost: dict[str, int], rest: str = "") -> str:
+    reasons = "".join(f"\n{reason.replace('_', ' ')} {count:,}" for reason, count in lost.items())
+    return f"{sum(lost.values()):,}{rest}{reasons}"
 
 
 @sessions_app.command("open")
