@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: demo test test-long lint bench clean
+.PHONY: demo test test-long faults lint bench clean
 .DELETE_ON_ERROR:
 
 $(VENV)/installed: pyproject.toml
@@ -27,6 +27,17 @@ test: $(VENV)/installed-dev
 
 test-long: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m long --timeout 3600 $(ARGS)
+
+# The release draws of the fault harness, some hours; ARGS="cuts --cuts 1000" makes one of them, smaller.
+faults: $(VENV)/installed-dev
+ifdef ARGS
+	$(BIN)/python -m tests.faults $(ARGS)
+else
+	$(BIN)/python -m tests.faults cuts
+	$(BIN)/python -m tests.faults faults
+	$(BIN)/python -m tests.faults flips
+	$(BIN)/python -m tests.faults kills
+endif
 
 # Open3D is large, and wanted here only; JSON=FILE chooses where the figures go.
 bench: $(VENV)/installed

@@ -17,6 +17,7 @@ from scanner_service.sessions.readiness import kernels_are_ready, warm_up
 from scanner_service.sessions.retention import Retention
 from scanner_service.storage.errors import RecordError
 from scanner_service.storage.record import Record
+from scanner_service.storage.rows import Limits
 
 _LOG = logging.getLogger(__name__)
 RETENTION_PERIOD_S = 3600.0
@@ -38,7 +39,13 @@ class Service:
         return kernels_are_ready()
 
     @classmethod
-    def open(cls, data_dir: Path, record_at: str | None = None, retention: Retention | None = None) -> "Service":
+    def open(
+        cls,
+        data_dir: Path,
+        record_at: str | None = None,
+        retention: Retention | None = None,
+        limits: Limits | None = None,
+    ) -> "Service":
         """Open the record and the keys in `data_dir`, and begin to compile the kernels.
 
         `record_at` is the address of a database, or a file, for the record to be elsewhere.
@@ -48,7 +55,7 @@ class Service:
         data_dir.mkdir(parents=True, exist_ok=True, mode=0o700)
         replay_dir = data_dir / "replay"
         replay_dir.mkdir(exist_ok=True)
-        record = Record.open(record_at or data_dir / "record.sqlite")
+        record = Record.open(record_at or data_dir / "record.sqlite", limits=limits)
         try:
             book = SessionBook(record, retention)
             access = Access.open(data_dir, time.monotonic, secrets.token_bytes)

@@ -13,6 +13,7 @@ from scanner_service.api.server import Listening, Tls, serve
 from scanner_service.api.service import Service
 from scanner_service.commands.terminal import errors, plain_errors
 from scanner_service.sessions.retention import Retention
+from scanner_service.storage.rows import Limits
 
 DATA_HELP = "Folder of the record, the keys and the replay files."
 Data = Annotated[Path, typer.Option("--data", envvar="SCANNER_DATA", help=DATA_HELP)]
@@ -42,6 +43,10 @@ def serve_command(
             help="Gigabytes that stored lines may take; the oldest sessions are deleted for it. No limit by default.",
         ),
     ] = None,
+    spool_mb: Annotated[
+        float,
+        typer.Option(envvar="SCANNER_SPOOL_MB", min=0.01, max=4096, help="Megabytes of lines kept while a disk fails."),
+    ] = 64.0,
     as_json: Annotated[bool, typer.Option("--json", help="Say where it listens as one line of JSON.")] = False,
 ) -> None:
     """Run the service: REST, live stream and viewer."""
@@ -51,7 +56,9 @@ def serve_command(
         tls = Tls(certificate, private_key) if certificate is not None and private_key is not None else None
         allowlist = Allowlist(frozenset(allow_host or ()), frozenset(allow_origin or ()))
         budget_bytes = None if disk_budget_gb is None else round(disk_budget_gb * 1e9)
-        service = Service.open(data, record, Retention(keep_days, budget_bytes))
+        service = Service.open(
+            data, record, Retention(keep_days, budget_bytes), Limits(spool_bytes=round(spool_mb * 1e6))
+        )
 
         def announce(listening: Listening) -> None:
             if as_json:

@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -88,6 +88,7 @@ class LiveSession:
         self._held = False
         self._kept: Mapping[str, Any] | None = None  # the account of losses that was written last
         self._disk = _DiskWatch()
+        self._owed: deque[tuple[str, dict[str, Any]]] = deque(maxlen=1000)  # events that a failing disk did not take
         self._closing = threading.Event()
         self._analyst = threading.Thread(target=self._analyse, name=f"analyst-{row.session_id}", daemon=True)
 
@@ -389,8 +390,7 @@ class LiveSession:
             begun_s = self._clock()
             try:
                 self._watch_the_disk()
-                if self._state in ("scanning", "paused"):
-                    self._keep_ledger()
+                self._keep_ledger()
                 if self._state in ("scanning", "paused") or self._results is None:
                     results = self._judge(unless=seen)
                     seen = results.snapshot.version if results is not None else seen
@@ -434,7 +434,9 @@ class LiveSession:
         self._kept = account
 
     def _watch_the_disk(self) -> None:
-        """Tell in the record, once it can be written again, that it could not be."""
+        """Tell in the record, once it can be written again, what it missed, and that it could not be."""
+        if self._owed and self._record.writer_state().state == "ok":
+            self._event(*self._owed.popleft())
         told = self._disk.look(self._record.writer_state(), self.engine.ledger, self._clock())
         if told is not None:
             self._event("record_resumed", told)
@@ -443,7 +445,8 @@ class LiveSession:
         try:
             self._record.append_event(self.row.session_id, kind, details, timeout_s=patience_s)
         except RecordError:
-            _LOG.warning("the event %s of session %s could not be recorded", kind, self.row.session_id)
+            _LOG.warning("the event %s of session %s will be recorded later", kind, self.row.session_id)
+            self._owed.append((kind, details))
 
     def _set_state(self, state: str) -> None:
         self._state = state

@@ -242,7 +242,7 @@ def _one_service(
         target=_guarded, args=(failures, lambda: _push(Client(url, key), pushed, target, done, rng.getrandbits(64)))
     )
     watcher = threading.Thread(
-        target=_guarded, args=(failures, lambda: _scan(Client(url, key), scanner, scanned, done, rng.random()))
+        target=_guarded, args=(failures, lambda: _scan(url, key, scanner, scanned, done, rng.random()))
     )
     for thread in (pusher, watcher):
         thread.start()
@@ -275,6 +275,15 @@ def _guarded(failures: list[BaseException], work: Callable[[], None]) -> None:
 
 def _push(client: Client, pushed: _Pushed, target: int, done: threading.Event, seed: int) -> None:
     """Push until `target` lines are acknowledged, and then on without waiting for the answer: the kill comes there."""
+    try:
+        index = _push_until(client, pushed, target, done, seed)
+    except BaseException:
+        client.close()
+        raise
+    threading.Thread(target=_guarded, args=([], lambda: _one_more(client, pushed, index)), daemon=True).start()
+
+
+def _push_until(client: Client, pushed: _Pushed, target: int, done: threading.Event, seed: int) -> int:
     rng = random.Random(seed)
     if not pushed.session:
         made = client.ask(
@@ -291,16 +300,22 @@ def _push(client: Client, pushed: _Pushed, target: int, done: threading.Event, s
             known = pushed.acknowledged.setdefault(line["line_index"], line["line_number"])
             assert line["outcome"] in ("stored", "duplicate") and known == line["line_number"], line
         index += count
-    threading.Thread(target=_guarded, args=([], lambda: _one_more(client, pushed, index)), daemon=True).start()
+    return index
 
 
 def _one_more(client: Client, pushed: _Pushed, index: int) -> None:
     lines = [pushed_line(line) for line in range(index, index + 64)]
-    client.ask("POST", f"/api/v1/sessions/{pushed.session}/scanlines", {"lines": lines})
+    with contextlib.closing(client):
+        client.ask("POST", f"/api/v1/sessions/{pushed.session}/scanlines", {"lines": lines})
 
 
-def _scan(client: Client, scanner: PtyPort, scanned: _Scanned, done: threading.Event, chance: float) -> None:
+def _scan(url: str, key: str, scanner: PtyPort, scanned: _Scanned, done: threading.Event, chance: float) -> None:
     """Scan over the pseudo-terminal, and note how far the service says that its lines are durable."""
+    with contextlib.closing(Client(url, key)) as client:
+        _watch_scan(client, scanner, scanned, done, chance)
+
+
+def _watch_scan(client: Client, scanner: PtyPort, scanned: _Scanned, done: threading.Event, chance: float) -> None:
     source = {
         "kind": "device",
         "port": str(scanner.path),
