@@ -15,7 +15,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ import numpy as np
 
 from benchmarks.machine import describe_machine
 from scanner_service.analysis.intake import StoredLine
+from scanner_service.sessions import session as session_module
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.settings import SessionSettings
@@ -187,35 +187,29 @@ def _rates(lines: Sequence[object], took_s: float, waited_s: list[float]) -> dic
 
 
 def measure_reopening(folder: Path, count: int) -> dict[str, Any]:
-    """A session of `count` lines, closed, then opened again: map built, losses told, ready for questions."""
+    """A session of `count` lines opened from the record: map built, losses told, ready for questions; not judged."""
     warm_up()
+    session_module.ANALYSIS_PERIOD_S = 1e6  # the verdict is measured elsewhere
     path = folder / "record"
+    settings = SessionSettings(max_points=count * POINTS_A_LINE).to_dict()
     with Record.open(path) as record:
-        book = SessionBook(record)
-        session = book.create("bench", PushSpec(), SessionSettings(max_points=count * POINTS_A_LINE))
-        last = None
+        source = PushSpec().to_dict()
+        session_id = record.create_session("bench", state="stopped", settings=settings, source=source).session_id
         for line in scan_lines(count):
-            last = record.append(session.row.session_id, replace(line), timeout_s=60.0)
-        assert last is not None
+            last = record.append(session_id, line, timeout_s=60.0)
         last.result()
-        session_id = session.row.session_id
-        book.close()
     with Record.open(path) as record:
         book = SessionBook(record)
         begun_s, cpu_s = time.perf_counter(), time.process_time()
         live = book.get(session_id)
         opened_s, cpu_s = time.perf_counter() - begun_s, time.process_time() - cpu_s
         points = live.status().points
-        asked_s = time.perf_counter()
-        live.fresh_results()
-        judged_s = time.perf_counter() - asked_s
         book.close()
     return {
         "lines": count,
         "points": points,
         "open_s": opened_s,
         "open_cpu_s": cpu_s,
-        "first_verdict_s": judged_s,
         "file_mb": path.stat().st_size / 1e6,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
     }
