@@ -138,6 +138,8 @@ class Batch:
                 "session_id": session.session_id,
                 "time_utc": session.created_utc,
             }
+            of_deleted = creations.c.key_sha256 == key.key_sha256  # of no other: `made_with` was asked
+            self._connection.execute(delete(creations).where(of_deleted))
             self._connection.execute(insert(creations).values(made | {"crc32": row_crc(made)}))
         self.tails[session.session_id] = Tail()
         return session
@@ -287,9 +289,9 @@ def session_made_with(connection: Connection, key: CreationKey) -> SessionRow | 
         .where(creations.c.key_sha256 == key.key_sha256)
     )
     row = connection.execute(query).mappings().first()
-    if row is None:
+    if row is None or row["deleted_utc"]:
         return None
-    if row["request_sha256"] != key.request_sha256 or row["deleted_utc"]:
+    if row["request_sha256"] != key.request_sha256:
         raise CreationKeyReused("this Idempotency-Key came before, with another request; send a new key")
     return session_from(dict(row))
 
