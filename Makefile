@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 ARGS ?=
 WORKERS ?= 2
 
-.PHONY: demo test test-long fuzz lint bench clean
+.PHONY: demo test test-long faults fuzz lint bench clean
 .DELETE_ON_ERROR:
 
 $(VENV)/installed: pyproject.toml
@@ -36,6 +36,17 @@ FUZZ ?= native scip lms lms_requests ls100 rplidar rplidar_samples rplidar_capsu
 fuzz: $(VENV)/installed-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[fuzz]'
 	for target in $(FUZZ); do $(BIN)/python -m tests.fuzz $$target -max_total_time=$(FUZZ_S) -max_len=2048 $(ARGS) || exit 1; done
+
+# The release draws of the fault harness, some hours; ARGS="cuts --cuts 1000" makes one of them, smaller.
+faults: $(VENV)/installed-dev
+ifdef ARGS
+	$(BIN)/python -m tests.faults $(ARGS)
+else
+	$(BIN)/python -m tests.faults cuts
+	$(BIN)/python -m tests.faults faults
+	$(BIN)/python -m tests.faults flips
+	$(BIN)/python -m tests.faults kills
+endif
 
 # Open3D is large, and wanted here only; JSON=FILE chooses where the figures go.
 bench: $(VENV)/installed

@@ -16,6 +16,7 @@ from scanner_service.commands.open_viewer import open_command
 from scanner_service.commands.replay import replay_command
 from scanner_service.commands.scan import scan_command
 from scanner_service.commands.serve import DEFAULT_DATA, serve_command
+from scanner_service.commands.sessions import sessions_app
 from scanner_service.commands.simulate import simulate_command
 
 app = typer.Typer(
@@ -35,6 +36,7 @@ app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)
 app.command("compare")(compare_command)
 app.command("simulate")(simulate_command)
+app.add_typer(sessions_app, name="sessions")
 app.add_typer(bench_app, name="bench")
 
 
@@ -53,7 +55,9 @@ def bare(
 ) -> None:
     """Without a command: serve with the defaults."""
     if context.invoked_subcommand is None:
-        serve_command(Path(os.environ.get("SCANNER_DATA") or DEFAULT_DATA))
+        serve_command(
+            Path(os.environ.get("SCANNER_DATA") or DEFAULT_DATA), record=os.environ.get("SCANNER_RECORD") or None
+        )
 
 
 def main() -> None:

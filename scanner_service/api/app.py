@@ -10,7 +10,7 @@ from scanner_service import __version__, web
 from scanner_service.analysis.errors import MapFull, MethodRefused, MethodUnknown, TooManyPasses
 from scanner_service.api.access import ACCESS_PROBLEMS
 from scanner_service.api.docs_page import install_docs
-from scanner_service.api.errors import ExportUnknown, ValueUnusable
+from scanner_service.api.errors import ExportUnknown, NotConfirmed, ValueUnusable
 from scanner_service.api.guard import Guard, GuardRules
 from scanner_service.api.login import login_router
 from scanner_service.api.origins import Allowlist
@@ -23,13 +23,14 @@ from scanner_service.sessions.errors import (
     AnalysesBusy,
     AnalysisNotDone,
     AnalysisUnknown,
+    BudgetSpent,
     LineRefused,
     SessionBusy,
     SessionError,
     SessionNotLive,
     SourceUnusable,
 )
-from scanner_service.storage.errors import RecordBusy, RecordError, SessionUnknown
+from scanner_service.storage.errors import CreationKeyReused, RecordBusy, RecordError, SessionUnknown
 from scanner_service.storage.exports.errors import ExportError
 from scanner_service.storage.formats.errors import FormatError
 
@@ -37,6 +38,9 @@ SESSION_PROBLEMS: ProblemTable = {
     SessionUnknown: Problem(404, "session-unknown", "There is no such session"),
     SessionBusy: Problem(409, "session-busy", "The session is in another state"),
     SessionNotLive: Problem(409, "session-not-live", "The session is not open"),
+    BudgetSpent: Problem(507, "budget-spent", "The disk budget is used up"),
+    NotConfirmed: Problem(409, "not-confirmed", "Deleting needs a confirmation"),
+    CreationKeyReused: Problem(422, "idempotency-key-reused", "The key came before, with another request"),
     SessionError: Problem(409, "session-error", "The session cannot do that"),
     SourceUnusable: Problem(422, "source-unusable", "The source cannot be read"),
     FormatError: Problem(422, "file-unusable", "The file cannot be read"),

@@ -21,7 +21,11 @@ class _Strict(BaseModel):
 
 
 class DeviceSourceIn(_Strict):
-    """One pass of a scanner that speaks the native protocol."""
+    """One pass of a scanner that speaks the native protocol.
+
+    `rearm`: after an interruption longer than the device's dead-man the laser is switched on again by itself and the
+    pass goes on; by default the session waits, paused, until it is resumed.
+    """
 
     kind: Literal["device"]
     port: Annotated[str, Field(min_length=1, max_length=500, examples=["/dev/ttyUSB0"])]
@@ -30,6 +34,7 @@ class DeviceSourceIn(_Strict):
     start_mm: Finite
     end_mm: Finite
     line_rate_hz: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] = 50.0
+    rearm: bool = False
 
 
 class RigSourceIn(_Strict):
@@ -86,6 +91,13 @@ class SessionIn(_Strict):
     source: Annotated[DeviceSourceIn | RigSourceIn | ReplaySourceIn | PushSourceIn, Field(discriminator="kind")]
     settings: SettingsIn = SettingsIn()
     origin_mm: Vector = (0.0, 0.0, 0.0)
+
+
+class DescriptionIn(_Strict):
+    """What a person says of a session; what is left out stays."""
+
+    name: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    notes: Annotated[str, Field(max_length=20_000)] | None = None
 
 
 class ScanlineIn(_Strict):

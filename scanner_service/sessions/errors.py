@@ -3,6 +3,7 @@
 SessionError
 ├── SessionNotLive      the session is in the record, but not open
 ├── SessionBusy         the request does not fit the session's state
+├── BudgetSpent         the disk budget is used up, and no session may be deleted to make room
 ├── SourceUnusable      what the session should read from cannot be read
 ├── LineRefused         one scanline was not taken in, for the reason told
 ├── AnalysisUnknown     there is no analysis of that id, or its room was needed
@@ -21,6 +22,10 @@ class SessionNotLive(SessionError):
 
 class SessionBusy(SessionError):
     """The request does not fit the state that the session is in."""
+
+
+class BudgetSpent(SessionError):
+    """The disk budget is used up, and no session may be deleted to make room."""
 
 
 class SourceUnusable(SessionError):

@@ -24,7 +24,10 @@ _PORT_PREFIXES = ("/dev/tty", "/dev/pts/", "/dev/serial/", "/dev/cu.")
 
 @dataclass(frozen=True, slots=True)
 class DeviceSpec:
-    """One pass of a native scanner: the port and its rate, and the pass from `start_mm` to `end_mm` of the stage."""
+    """One pass of a native scanner: the port and its rate, and the pass from `start_mm` to `end_mm` of the stage.
+
+    `rearm`: see `PassRequest`.
+    """
 
     port: str
     baud_rate: int
@@ -32,6 +35,7 @@ class DeviceSpec:
     start_mm: float
     end_mm: float
     line_rate_hz: float
+    rearm: bool = False
 
     def __post_init__(self) -> None:
         numbers = (self.line_spacing_mm, self.start_mm, self.end_mm, self.line_rate_hz)
@@ -54,7 +58,7 @@ class DeviceSpec:
             raise SourceUnusable(f"{self.port} is not a serial device: name one such as /dev/ttyUSB0")
         scanner = NativeScanner(self.port, self.baud_rate)
         info = scanner.enter()
-        request = PassRequest(self.line_spacing_mm, self.start_mm, self.end_mm, self.line_rate_hz)
+        request = PassRequest(self.line_spacing_mm, self.start_mm, self.end_mm, self.line_rate_hz, self.rearm)
         return DeviceSource(scanner, Rig(), request, info)
 
     def to_dict(self) -> dict[str, Any]:

@@ -5,13 +5,13 @@ import { byId, element } from "./element.js";
 import { drawRuler, drawTriad } from "./gauges.js";
 import { listenToKeys } from "./keyboard.js";
 import { drawLegend } from "./legend.js";
-import { words } from "./numbers.js";
+import { whole, words } from "./numbers.js";
 import { drawFigures, drawInspector, drawLosses, drawRegions } from "./panels.js";
 import { pickPoint } from "./picking.js";
 import { PointCloud } from "./point_cloud.js";
 import { RegionOverlay } from "./region_overlay.js";
 import { SceneView } from "./scene_view.js";
-import { exportAddress, listSessions, startSession, stopSession } from "./service.js";
+import { exportAddress, listSessions, pauseSession, resumeSession, startSession, stopSession } from "./service.js";
 import { SessionPicker } from "./session_picker.js";
 import { OVER, SessionView } from "./session_view.js";
 
@@ -27,7 +27,7 @@ let connectionState = "none";
 let frames = 0;
 let troubled = { text: "", until: 0 };
 
-const session = new SessionView({ points, status, regions, connection, trouble });
+const session = new SessionView({ points, status, regions, opening, connection, trouble });
 const view = openView();
 const cloud = new PointCloud(session.store);
 const overlay = new RegionOverlay(byId("labels"), chooseRegion);
@@ -69,6 +69,8 @@ function status() {
   state.dataset.state = told.state;
   byId("stop").hidden = OVER.has(told.state) || told.state === "created";
   byId("start").hidden = !session.startable;
+  byId("pause").hidden = told.state !== "scanning" || !told.can_pause;
+  byId("resume").hidden = told.state !== "paused" || !told.held;
   byId("start").textContent = told.state === "created" ? "Start" : "Go on";
   byId("stop-note").hidden = byId("stop").hidden;
   explainEmptiness();
@@ -79,6 +81,15 @@ function status() {
   say();
   drawFigures(byId("figures"), told, session.store, session.box);
   drawLosses(byId("losses"), byId("losses-count"), told.losses);
+}
+
+// The service builds the map of a closed session from the record, line by line.
+function opening({ lines, of, progress: share }) {
+  notice(`Opening from the record: ${whole(lines)} of ${whole(of)} scanlines`);
+  const progress = byId("progress");
+  progress.hidden = false;
+  progress.value = share;
+  progress.dataset.state = "opening";
 }
 
 function regions() {
@@ -180,7 +191,7 @@ function openSession(chosen) {
   byId("session-name").textContent = chosen.name || chosen.id;
   document.title = `${chosen.name || chosen.id} – scan viewer`;
   byId("session-state").hidden = true;
-  byId("start").hidden = byId("stop").hidden = true;
+  for (const id of ["start", "pause", "resume", "stop"]) byId(id).hidden = true;
   history.replaceState(null, "", `?session=${encodeURIComponent(chosen.id)}`);
   chosenRegion = null;
   inspect(-1);
@@ -311,6 +322,8 @@ function listen() {
     });
   }
   byId("start").addEventListener("click", (event) => command(event.currentTarget, startSession));
+  byId("pause").addEventListener("click", (event) => command(event.currentTarget, pauseSession));
+  byId("resume").addEventListener("click", (event) => command(event.currentTarget, resumeSession));
   byId("stop").addEventListener("click", (event) => command(event.currentTarget, stopSession));
   byId("retry").addEventListener("click", () => session.retryNow());
   addEventListener("online", () => session.retryNow());

@@ -32,6 +32,13 @@ export const startSession = (id) => answer(sessionPath(id, "start"), { method: "
 
 export const stopSession = (id) => answer(sessionPath(id, "stop"), { method: "POST" });
 
+export const pauseSession = (id) => answer(sessionPath(id, "pause"), { method: "POST" });
+
+export const resumeSession = (id) => answer(sessionPath(id, "resume"), { method: "POST" });
+
+// `confirm` is the id once more: the service deletes nothing without it.
+export const deleteSession = (id) => answer(`api/v1/sessions/${encodeURIComponent(id)}?confirm=${encodeURIComponent(id)}`, { method: "DELETE" });
+
 export const exportAddress = (id, file) => address(sessionPath(id, `export/${file}`));
 
 export function liveAddress(id) {
