@@ -10,6 +10,7 @@ from scanner_service import __version__
 from scanner_service.commands.analyse import analyse_command
 from scanner_service.commands.bench import bench_app
 from scanner_service.commands.demo import demo_command
+from scanner_service.commands.export import export_command, verify_command
 from scanner_service.commands.open_viewer import open_command
 from scanner_service.commands.replay import replay_command
 from scanner_service.commands.serve import DEFAULT_DATA, serve_command
@@ -27,6 +28,8 @@ app.command("open")(open_command)
 app.command("demo")(demo_command)
 app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)
+app.command("export")(export_command)
+app.command("verify")(verify_command)
 app.command("simulate")(simulate_command)
 app.add_typer(bench_app, name="bench")
 

@@ -9,7 +9,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Select, func, select
+from sqlalchemy import Connection, Select, Table, func, select
 from sqlalchemy.exc import DBAPIError
 
 from scanner_service.analysis.intake import StoredLine
@@ -18,7 +18,7 @@ from scanner_service.storage.database import check_identity, reader_engine
 from scanner_service.storage.encoding import decode_line
 from scanner_service.storage.errors import LineDamaged, NotARecord, RecordUnreadable, SessionUnknown
 from scanner_service.storage.rows import Count, DamagedLine, EventRow, SessionRow, Verification, Watermark
-from scanner_service.storage.tables import events, from_json, lines, row_crc, sessions
+from scanner_service.storage.tables import events, from_json, lines, metadata, row_crc, sessions
 from scanner_service.storage.tail import load_count, load_tail
 
 _LINES_A_CHUNK = 32
@@ -100,6 +100,16 @@ class RecordReader:
         end = self.count(session_id).lines
         return self._lines(session_id, max(start, 0), end if stop is None else min(stop, end), on_damage)
 
+    def stored_rows(self, session_id: str) -> Iterator[tuple[Table, list[dict[str, Any]]]]:
+        """Every row of a session as it is stored, damaged or not: table by table, lines in chunks; for copies.
+
+        Raises
+        ------
+        SessionUnknown : at once.
+        """
+        self.get_session(session_id)
+        return self._stored_rows(session_id)
+
     def verify(self, session_id: str) -> Verification:
         """Read everything of a session, and the structure of the whole file, and say what is damaged."""
         damaged: list[DamagedLine] = []
@@ -123,6 +133,18 @@ class RecordReader:
             if rows != seen:
                 problems.append(f"{rows} {table.name} are in the table, {seen} in its index")
         return Verification(Count(sound_lines, points), tuple(damaged), tuple(problems))
+
+    def _stored_rows(self, session_id: str) -> Iterator[tuple[Table, list[dict[str, Any]]]]:
+        for table in metadata.sorted_tables:
+            if table is lines or "session_id" not in table.c:
+                continue
+            if found := self._rows(select(table).where(table.c.session_id == session_id)):
+                yield table, found
+        last = -1
+        query = select(lines).where(lines.c.session_id == session_id).order_by(lines.c.line_number)
+        while chunk := self._rows(query.where(lines.c.line_number > last).limit(_LINES_A_CHUNK)):
+            yield lines, chunk
+            last = chunk[-1]["line_number"]
 
     def _structure(self) -> Iterator[str]:
         """What SQLite itself finds wrong with the file; it sees no flipped bit of a value."""
