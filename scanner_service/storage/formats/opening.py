@@ -136,8 +136,8 @@ def _kind_of_file(path: Path, options: ReadOptions) -> Kind:
 
 
 def _content(path: Path, options: ReadOptions) -> bytes:
-    with _readable(path), path.open("rb") as file:
-        data = file.read(options.max_bytes + 1)
+    with _readable(path):
+        data = path.read_bytes()
     if len(data) > options.max_bytes:  # it grew meanwhile
         raise FileTooLarge(f"{path.name} has more than {options.max_bytes} bytes, which is as much as is read")
     return data
