@@ -13,6 +13,7 @@ from scanner_service.commands.demo import demo_command
 from scanner_service.commands.export import export_command, verify_command
 from scanner_service.commands.open_viewer import open_command
 from scanner_service.commands.replay import replay_command
+from scanner_service.commands.report import report_command
 from scanner_service.commands.serve import DEFAULT_DATA, serve_command
 from scanner_service.commands.simulate import simulate_command
 
@@ -29,6 +30,7 @@ app.command("demo")(demo_command)
 app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)
 app.command("export")(export_command)
+app.command("report")(report_command)
 app.command("verify")(verify_command)
 app.command("simulate")(simulate_command)
 app.add_typer(bench_app, name="bench")

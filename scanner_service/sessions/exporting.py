@@ -8,19 +8,24 @@ from typing import Any
 from scanner_service import __version__
 from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.outputs import stored_outcome, write_output
+from scanner_service.sessions.reporting import report_of
 from scanner_service.sessions.stored import StoredSession, read_session
 from scanner_service.storage.exports.errors import ExtraMissing, FormatNotWritten
 from scanner_service.storage.exports.manifest import write_manifest
 from scanner_service.storage.exports.point_files import POINT_FORMATS
 from scanner_service.storage.exports.point_stream import stream_of
 from scanner_service.storage.exports.record_file import write_session_record
+from scanner_service.storage.exports.report_html import report_html
+from scanner_service.storage.exports.report_pdf import report_pdf
+from scanner_service.storage.exports.whole_file import write_whole
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.rows import SessionRow
 
 RECORD_FILE = "session.sqlite"
 RESULT_FILES = ("density.png", "regions.json", "summary.json")
-RESULTS, RECORD = "results", "record"
-FORMATS = (*POINT_FORMATS, RESULTS, RECORD)
+REPORT_FILES = ("report.html", "report.pdf")
+RESULTS, RECORD, REPORT = "results", "record", "report"
+FORMATS = (*POINT_FORMATS, RESULTS, RECORD, REPORT)
 OnProgress = Callable[[str, float], None]
 
 
@@ -63,14 +68,16 @@ def export_session(
     check_formats(formats)
     folder.mkdir(parents=True, exist_ok=True)
     wanted = [name for name in FORMATS if name in formats]
-    stored = read_session(reader, row, lambda share: on_progress("reading the record", share))
+    stored = read_session(reader, row, lambda share: on_progress("reading the record", share), REPORT in wanted)
     written: list[str] = []
     for name in wanted:
-        written += _write(name, reader, stored, folder, on_progress)
+        written += _write(name, reader, stored, folder, now, on_progress)
     return write_manifest(folder, written, _facts(stored, now))
 
 
-def _write(name: str, reader: RecordReader, stored: StoredSession, folder: Path, on_progress: OnProgress) -> list[str]:
+def _write(
+    name: str, reader: RecordReader, stored: StoredSession, folder: Path, now: datetime, on_progress: OnProgress
+) -> list[str]:
     """Write one format; the names of its files."""
     on_progress(name, 0.0)
     if name in POINT_FORMATS:
@@ -83,6 +90,12 @@ def _write(name: str, reader: RecordReader, stored: StoredSession, folder: Path,
     if name == RECORD:
         write_session_record(folder / RECORD_FILE, reader, stored.row, lambda share: on_progress(name, share))
         return [RECORD_FILE]
+    if name == REPORT:
+        content = report_of(stored, now)
+        for done, (file_name, write) in enumerate(zip(REPORT_FILES, (report_html, report_pdf), strict=True)):
+            write_whole(folder / file_name, write(content))
+            on_progress(name, (done + 1) / len(REPORT_FILES))
+        return list(REPORT_FILES)
     for done, output in enumerate(RESULT_FILES):
         write_output(output, folder / output, stored_outcome(stored))
         on_progress(name, (done + 1) / len(RESULT_FILES))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scanner_service.storage.exports.about import About
@@ -119,6 +119,7 @@ def test_pcd_files_that_are_wrong_are_refused_in_one_sentence(tmp_path, data, er
         kept(tmp_path, "a.pcd", data)
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(st.binary(min_size=1, max_size=40), st.integers(1, 300), st.integers(1, 40)), max_size=12))
 def test_lzf_gives_back_what_a_plain_packer_packed(pieces):
     whole, packed = bytearray(), bytearray()
