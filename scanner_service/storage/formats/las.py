@@ -35,6 +35,13 @@ _METRES: UnitAndWhy = (
     "m",
     "lengths are read as metres, as LAS files usually are; give the units if they are not",
 )
+_LAYERED = 3
+_LAYERS_OF_ITEM = {
+    10: 9,
+    11: 1,
+    12: 2,
+    13: 1,
+}  # point, colour, colour and infrared, wave packet; extra bytes: one a byte
 Bytes = npt.NDArray[np.uint8]
 
 
@@ -84,7 +91,8 @@ def read_las(path: Path, units: Units | None, max_bytes: int) -> Cloud:
             count = min(left, _BLOCK_POINTS)
             rows = _rows(file, header, count, name) if unpack is None else unpack(count)
             whole = rows[:, :12].copy().view("<i4").astype(np.float64)
-            points.append(whole * header.scale + header.offset)
+            with np.errstate(over="ignore", invalid="ignore"):  # damaged scales; infinite points are counted as such
+                points.append(whole * header.scale + header.offset)
             if places:
                 parts = [rows[:, at : at + int(kind[1:])].copy().view(f"<{kind}") for at, kind in places]
                 with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
@@ -206,6 +214,8 @@ def _unpacker(file: BinaryIO, header: LasHeader, size: int, name: str) -> Any:
         raise LibraryAbsent(
             f"{name} is packed, and lazrs, which unpacks it, is not installed: run `pip install 'scanner-service[las]'`"
         ) from None
+    if struct.unpack_from("<H", note)[0] == _LAYERED:
+        _check_layers(file, header, note, lazrs, name)
     file.seek(header.points_at)
     with _refusing(name):
         source = lazrs.LasZipDecompressor(file, note)
@@ -247,3 +257,24 @@ def _check_chunk_table(file: BinaryIO, header: LasHeader, size: int, name: str) 
     _, chunks = struct.unpack("<II", file.read(8))
     if chunks * header.point_bytes > table_at - header.points_at:
         raise wrong
+
+
+def _check_layers(file: BinaryIO, header: LasHeader, note: bytes, lazrs: Any, name: str) -> None:
+    """Every chunk of a newer LAZ file says how long its layers are, and lazrs makes room for as much."""
+    wrong = ContentDamaged(f"{name}: its packed points are damaged or cut short")
+    layers = 0
+    for at in range(34, len(note), 6):
+        kind, width = struct.unpack_from("<HH", note, at)
+        layers += width if kind == 14 else _LAYERS_OF_ITEM.get(kind, 0)
+    file.seek(header.points_at)
+    with _refusing(name):
+        table = lazrs.read_chunk_table(file, lazrs.LazVlr(note))
+    at = header.points_at + 8
+    for _, chunk_bytes in table or ():
+        file.seek(at + header.point_bytes + 4)
+        sizes = file.read(4 * layers)
+        if len(sizes) < 4 * layers:
+            raise wrong
+        if sum(struct.unpack(f"<{layers}I", sizes)) + len(sizes) + 4 + header.point_bytes > chunk_bytes:
+            raise wrong
+        at += chunk_bytes
