@@ -11,7 +11,9 @@ from prometheus_client import CollectorRegistry
 from scanner_service.api.access import Access
 from scanner_service.api.metrics import metrics_of
 from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.export_desk import ExportDesk
 from scanner_service.sessions.readiness import kernels_are_ready, warm_up
+from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
 
 
@@ -23,6 +25,7 @@ class Service:
     access: Access
     replay_dir: Path
     metrics: CollectorRegistry
+    exports: ExportDesk
 
     @property
     def kernels_ready(self) -> bool:
@@ -42,15 +45,17 @@ class Service:
         try:
             book = SessionBook(record)
             access = Access.open(data_dir, time.monotonic, secrets.token_bytes)
+            exports = ExportDesk(data_dir / "exports", lambda: RecordReader.open(data_dir / "record.sqlite"))
         except BaseException:
             record.close()
             raise
         threading.Thread(target=warm_up, name="warm-up", daemon=True).start()
-        return cls(book, access, replay_dir, metrics_of(book))
+        return cls(book, access, replay_dir, metrics_of(book), exports)
 
     def close(self) -> None:
         """Stop the sessions, write what waits, let go of the record."""
         try:
+            self.exports.close()
             self.book.close()
         finally:
             self.book.record.close()

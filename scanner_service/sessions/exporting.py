@@ -26,7 +26,7 @@ RESULT_FILES = ("density.png", "regions.json", "summary.json")
 REPORT_FILES = ("report.html", "report.pdf")
 RESULTS, RECORD, REPORT = "results", "record", "report"
 FORMATS = (*POINT_FORMATS, RESULTS, RECORD, REPORT)
-OnProgress = Callable[[str, float], None]
+OnProgress = Callable[[str, float], object]
 
 
 def check_formats(formats: Sequence[str]) -> None:
@@ -42,9 +42,14 @@ def check_formats(formats: Sequence[str]) -> None:
     for name in formats:
         if name not in FORMATS:
             raise FormatNotWritten(f"there is no export format {name}; the formats are {', '.join(FORMATS)}")
-        missing = POINT_FORMATS[name].missing() if name in POINT_FORMATS else None
+        missing = missing_for(name)
         if missing is not None:
             raise ExtraMissing(missing)
+
+
+def missing_for(name: str) -> str | None:
+    """Why a format cannot be written here, as one sentence; None when it can."""
+    return POINT_FORMATS[name].missing() if name in POINT_FORMATS else None
 
 
 def export_session(
