@@ -20,7 +20,7 @@ from scanner_service.storage.exports.about import About
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.rows import SessionRow
 
-OnShare = Callable[[float], None]
+OnShare = Callable[[float], object]
 MOST_STAGES = 12
 
 

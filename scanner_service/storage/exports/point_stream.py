@@ -13,7 +13,7 @@ from scanner_service.analysis.snapshot import Int32Array, MapSnapshot, UInt8Arra
 
 Int64Array = npt.NDArray[np.int64]
 BLOCK_POINTS = 1 << 16
-OnPoints = Callable[[int], None]
+OnPoints = Callable[[int], object]
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from scanner_service.storage.tables import lines
 
 
 def write_session_record(
-    path: Path, reader: RecordReader, row: SessionRow, on_share: Callable[[float], None] = lambda share: None
+    path: Path, reader: RecordReader, row: SessionRow, on_share: Callable[[float], object] = lambda share: None
 ) -> None:
     """Copy a session into a new record at `path`, whole or not at all; the session keeps its id.
 

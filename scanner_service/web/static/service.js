@@ -32,6 +32,17 @@ export const startSession = (id) => answer(sessionPath(id, "start"), { method: "
 
 export const stopSession = (id) => answer(sessionPath(id, "stop"), { method: "POST" });
 
+const JSON_BODY = { "content-type": "application/json" };
+
+// {formats, exports}: what can be written, and what was.
+export const listExports = (id) => answer(sessionPath(id, "exports"));
+
+export const orderExport = (id, formats) => answer(sessionPath(id, "exports"), { method: "POST", headers: { accept: "application/json", ...JSON_BODY }, body: JSON.stringify({ formats }) });
+
+export const getExport = (id, job) => answer(sessionPath(id, `exports/${encodeURIComponent(job)}`));
+
+export const fileAddress = (id, job, file) => address(sessionPath(id, `exports/${encodeURIComponent(job)}/files/${encodeURIComponent(file)}`));
+
 export const exportAddress = (id, file) => address(sessionPath(id, `export/${file}`));
 
 export function liveAddress(id) {
