@@ -207,7 +207,7 @@ def _unpacker(file: BinaryIO, header: LasHeader, size: int, name: str) -> Any:
             f"{name} is cut short or its header is wrong: {header.points} points are declared, and {size} bytes can "
             "hardly hold them; write it as LAS if it is right"
         )
-    _check_chunk_table(file, header, size, name)
+    table_at = _check_chunk_table(file, header, size, name)
     try:
         import lazrs  # noqa: PLC0415 - an extra
     except ImportError:
@@ -215,7 +215,7 @@ def _unpacker(file: BinaryIO, header: LasHeader, size: int, name: str) -> Any:
             f"{name} is packed, and lazrs, which unpacks it, is not installed: run `pip install 'scanner-service[las]'`"
         ) from None
     if struct.unpack_from("<H", note)[0] == _LAYERED:
-        _check_layers(file, header, note, lazrs, name)
+        _check_layers(file, header, note, table_at, lazrs, name)
     file.seek(header.points_at)
     with _refusing(name):
         source = lazrs.LasZipDecompressor(file, note)
@@ -240,8 +240,8 @@ def _refusing(name: str) -> Iterator[None]:
         raise ContentDamaged(f"{name}: its packed points are damaged or cut short") from error
 
 
-def _check_chunk_table(file: BinaryIO, header: LasHeader, size: int, name: str) -> None:
-    """The table at the end says how many chunks there are; each holds at least one point as it is."""
+def _check_chunk_table(file: BinaryIO, header: LasHeader, size: int, name: str) -> int:
+    """Where the table is that says how many chunks there are; each holds at least one point as it is."""
     wrong = FileTruncated(f"{name} is cut short or damaged: its table of chunks is not where it should be")
     file.seek(header.points_at)
     place = file.read(8)
@@ -257,9 +257,10 @@ def _check_chunk_table(file: BinaryIO, header: LasHeader, size: int, name: str) 
     _, chunks = struct.unpack("<II", file.read(8))
     if chunks * header.point_bytes > table_at - header.points_at:
         raise wrong
+    return int(table_at)
 
 
-def _check_layers(file: BinaryIO, header: LasHeader, note: bytes, lazrs: Any, name: str) -> None:
+def _check_layers(file: BinaryIO, header: LasHeader, note: bytes, table_at: int, lazrs: Any, name: str) -> None:
     """Every chunk of a newer LAZ file says how long its layers are, and lazrs makes room for as much."""
     wrong = ContentDamaged(f"{name}: its packed points are damaged or cut short")
     layers = 0
@@ -268,9 +269,11 @@ def _check_layers(file: BinaryIO, header: LasHeader, note: bytes, lazrs: Any, na
         layers += width if kind == 14 else _LAYERS_OF_ITEM.get(kind, 0)
     file.seek(header.points_at)
     with _refusing(name):
-        table = lazrs.read_chunk_table(file, lazrs.LazVlr(note))
+        table = lazrs.read_chunk_table(file, lazrs.LazVlr(note)) or ()
     at = header.points_at + 8
-    for _, chunk_bytes in table or ():
+    if sum(chunk_bytes for _, chunk_bytes in table) != table_at - at:
+        raise wrong
+    for _, chunk_bytes in table:
         file.seek(at + header.point_bytes + 4)
         sizes = file.read(4 * layers)
         if len(sizes) < 4 * layers:
