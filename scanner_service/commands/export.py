@@ -19,6 +19,7 @@ from scanner_service.commands.terminal import (
 )
 from scanner_service.sessions.exporting import FORMATS, check_formats, export_session
 from scanner_service.sessions.stored import find_session
+from scanner_service.sessions.tiles import POINTS_AT_ONCE
 from scanner_service.storage.exports.manifest import MANIFEST, verify_folder
 
 
@@ -30,6 +31,9 @@ def export_command(
     out: Annotated[Path, typer.Option(help="Folder for the files and their manifest.")] = Path("out"),
     data: Data = DEFAULT_DATA,
     record: RecordFile = None,
+    points_at_once: Annotated[
+        int, typer.Option(min=1, help="A session of more points is written in slabs, without regions.")
+    ] = POINTS_AT_ONCE,
     as_json: Annotated[bool, typer.Option("--json", help="Print the manifest as JSON.")] = False,
 ) -> None:
     """Write a session in other programs' formats, with a manifest of hashes; PLY when no format is named."""
@@ -40,7 +44,7 @@ def export_command(
         check_folder(out)
         with open_reader(data, record) as reader, work_progress("exporting", as_json) as progress:
             row = find_session(reader, session)
-            manifest = export_session(reader, row, wanted, out, datetime.now(UTC), progress.show)
+            manifest = export_session(reader, row, wanted, out, datetime.now(UTC), progress.show, points_at_once)
         for damaged in manifest["damaged_lines"]:
             errors.print(f"left out: {damaged}", highlight=False, soft_wrap=True)
         if as_json:

@@ -9,11 +9,13 @@ from scanner_service import __version__
 from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.outputs import stored_outcome, write_output
 from scanner_service.sessions.reporting import report_of
-from scanner_service.sessions.stored import StoredSession, read_session
-from scanner_service.storage.exports.errors import ExtraMissing, FormatNotWritten
+from scanner_service.sessions.stored import StoredSession, about_of, read_session
+from scanner_service.sessions.tiles import POINTS_AT_ONCE, read_in_tiles
+from scanner_service.storage.exports.about import About
+from scanner_service.storage.exports.errors import ExtraMissing, FormatNotWritten, NotExportable
 from scanner_service.storage.exports.manifest import write_manifest
 from scanner_service.storage.exports.point_files import POINT_FORMATS
-from scanner_service.storage.exports.point_stream import stream_of
+from scanner_service.storage.exports.point_stream import PointStream, stream_of
 from scanner_service.storage.exports.record_file import write_session_record
 from scanner_service.storage.exports.report_html import report_html
 from scanner_service.storage.exports.report_pdf import report_pdf
@@ -59,11 +61,13 @@ def export_session(
     folder: Path,
     now: datetime,
     on_progress: OnProgress = lambda what, share: None,
+    points_at_once: int = POINTS_AT_ONCE,
 ) -> dict[str, Any]:
     """Write a session in the formats asked for, and the manifest of the files; returns the manifest.
 
     Each file appears under its name when it is whole, the manifest last. `on_progress` is told what is being done,
-    and the share of it that is done.
+    and the share of it that is done. A session of more than `points_at_once` points is never in memory as a whole:
+    its points are written without a verdict, slab by slab.
 
     Raises
     ------
@@ -71,49 +75,73 @@ def export_session(
     RecordError : the record cannot be read.
     """
     check_formats(formats)
-    folder.mkdir(parents=True, exist_ok=True)
     wanted = [name for name in FORMATS if name in formats]
-    stored = read_session(reader, row, lambda share: on_progress("reading the record", share), REPORT in wanted)
+    points = reader.count(row.session_id).points
+    if points > points_at_once and {RESULTS, REPORT} & set(wanted):
+        raise NotExportable(
+            f"regions and coverage need all {points} points of the session in memory, and {points_at_once} at once are "
+            "allowed: leave out results and report, or allow more"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
     written: list[str] = []
+    if points > points_at_once:
+        tiled = read_in_tiles(reader, row, points_at_once, lambda share: on_progress("reading the record", share))
+        about = about_of(row, tiled.raw_sha256)
+        for name in wanted:
+            if name == RECORD:
+                written += _write_record(reader, row, folder, on_progress)
+            else:
+                written += _write_points(name, tiled.stream, about, folder, on_progress)
+        facts = {"lines": tiled.lines, "points": tiled.stream.total, "damaged_lines": list(tiled.damaged)}
+        return write_manifest(folder, written, _facts(about, now) | facts | {"verdict_sha256": None})
+    stored = read_session(reader, row, lambda share: on_progress("reading the record", share), REPORT in wanted)
+    results = stored.results
+    stream = stream_of(results.snapshot, results.verdict.rescan, results.verdict.reason)
     for name in wanted:
-        written += _write(name, reader, stored, folder, now, on_progress)
-    return write_manifest(folder, written, _facts(stored, now))
+        if name in POINT_FORMATS:
+            written += _write_points(name, stream, stored.about, folder, on_progress)
+        elif name == RECORD:
+            written += _write_record(reader, row, folder, on_progress)
+        elif name == REPORT:
+            written += _write_report(stored, folder, now, on_progress)
+        else:
+            written += _write_results(stored, folder, on_progress)
+    facts = {
+        "lines": stored.lines,
+        "points": len(results.snapshot),
+        "damaged_lines": list(stored.damaged),
+        "verdict_sha256": verdict_sha256(results),
+    }
+    return write_manifest(folder, written, _facts(stored.about, now) | facts)
 
 
-def _write(
-    name: str, reader: RecordReader, stored: StoredSession, folder: Path, now: datetime, on_progress: OnProgress
-) -> list[str]:
-    """Write one format; the names of its files."""
+def _write_points(name: str, stream: PointStream, about: About, folder: Path, on_progress: OnProgress) -> list[str]:
     on_progress(name, 0.0)
-    if name in POINT_FORMATS:
-        one = POINT_FORMATS[name]
-        results = stored.results
-        stream = stream_of(results.snapshot, results.verdict.rescan, results.verdict.reason)
-        total = max(stream.total, 1)
-        one.write(folder / one.file_name, stream.told(lambda done: on_progress(name, done / total)), stored.about)
-        return [one.file_name]
-    if name == RECORD:
-        write_session_record(folder / RECORD_FILE, reader, stored.row, lambda share: on_progress(name, share))
-        return [RECORD_FILE]
-    if name == REPORT:
-        content = report_of(stored, now)
-        for done, (file_name, write) in enumerate(zip(REPORT_FILES, (report_html, report_pdf), strict=True)):
-            write_whole(folder / file_name, write(content))
-            on_progress(name, (done + 1) / len(REPORT_FILES))
-        return list(REPORT_FILES)
+    one, total = POINT_FORMATS[name], max(stream.total, 1)
+    one.write(folder / one.file_name, stream.told(lambda done: on_progress(name, done / total)), about)
+    return [one.file_name]
+
+
+def _write_record(reader: RecordReader, row: SessionRow, folder: Path, on_progress: OnProgress) -> list[str]:
+    write_session_record(folder / RECORD_FILE, reader, row, lambda share: on_progress(RECORD, share))
+    return [RECORD_FILE]
+
+
+def _write_report(stored: StoredSession, folder: Path, now: datetime, on_progress: OnProgress) -> list[str]:
+    content = report_of(stored, now)
+    for done, (file_name, write) in enumerate(zip(REPORT_FILES, (report_html, report_pdf), strict=True)):
+        on_progress(REPORT, done / len(REPORT_FILES))
+        write_whole(folder / file_name, write(content))
+    return list(REPORT_FILES)
+
+
+def _write_results(stored: StoredSession, folder: Path, on_progress: OnProgress) -> list[str]:
     for done, output in enumerate(RESULT_FILES):
+        on_progress(RESULTS, done / len(RESULT_FILES))
         write_output(output, folder / output, stored_outcome(stored))
-        on_progress(name, (done + 1) / len(RESULT_FILES))
     return list(RESULT_FILES)
 
 
-def _facts(stored: StoredSession, now: datetime) -> dict[str, Any]:
-    return {
-        **stored.about.to_dict(),
-        "version": __version__,
-        "written_utc": now.isoformat(timespec="seconds").replace("+00:00", "Z"),
-        "lines": stored.lines,
-        "points": len(stored.results.snapshot),
-        "damaged_lines": list(stored.damaged),
-        "verdict_sha256": verdict_sha256(stored.results),
-    }
+def _facts(about: About, now: datetime) -> dict[str, Any]:
+    written = now.isoformat(timespec="seconds").replace("+00:00", "Z")
+    return {**about.to_dict(), "version": __version__, "written_utc": written}

@@ -14,9 +14,9 @@ from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec, RecordSpec
 from scanner_service.sessions.sources import ReplaySource
 from scanner_service.sessions.stored import find_session, pass_ends, read_session
-from scanner_service.storage.exports.errors import ExtraMissing, FormatNotWritten
+from scanner_service.storage.exports.errors import ExtraMissing, FormatNotWritten, NotExportable
 from scanner_service.storage.exports.manifest import verify_folder
-from scanner_service.storage.formats import open_cloud
+from scanner_service.storage.formats import open_cloud, open_recording
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
 from tests.unit.analysis.scans import surface_scan
@@ -211,3 +211,24 @@ def test_formats_that_do_not_exist_are_refused_before_any_work(scanned, tmp_path
     with pytest.raises(FormatNotWritten, match="the formats are ply, laz"):
         export(scanned[0], formats, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_session_of_more_points_than_allowed_is_written_in_slabs_without_a_verdict(scanned, tmp_path):
+    path, _, _ = scanned
+    reader = RecordReader.open(path)
+    row = find_session(reader, "latest")
+    manifest = export_session(reader, row, ["ply", "csv", "record"], tmp_path / "slabs", NOW, points_at_once=500)
+    with pytest.raises(NotExportable, match="leave out results and report"):
+        export_session(reader, row, ["report"], tmp_path / "report", NOW, points_at_once=500)
+    reader.close()
+    assert not (tmp_path / "report").exists()
+    assert verify_folder(tmp_path / "slabs").problems == ()
+    assert manifest["verdict_sha256"] is None
+    export(path, ["ply"], tmp_path / "whole")
+    theirs, ours = (open_cloud(tmp_path / name / "points.ply") for name in ("whole", "slabs"))
+    assert manifest["points"] == len(theirs.points_mm)
+    orders = [np.lexsort(cloud.points_mm.T) for cloud in (theirs, ours)]
+    np.testing.assert_array_equal(ours.points_mm[orders[1]], theirs.points_mm[orders[0]])
+    np.testing.assert_array_equal(ours.normals[orders[1]], theirs.normals[orders[0]])
+    lines = open_recording(tmp_path / "slabs" / "points.csv").lines
+    assert sum(len(line.points_mm) for line in lines) == manifest["points"]

@@ -67,15 +67,21 @@ def sealed(data):
     return b"".join(page + struct.pack(">I", _crc32c(page)) for page in pages)
 
 
+def peak_mb():
+    """The most memory that this process has taken so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
 def read_all(folder, count, rng):
-    """Read so many damaged files; how they ended, and every end that is none of the allowed ones."""
+    """Read so many damaged files; how they ended, what should not be, and what one of them took at most."""
     sources = sorted(path for path in folder.iterdir() if path.name.startswith("whole."))
-    ends, faults = {}, []
+    ends, faults, largest_mb = {}, [], 0.0
     for number in range(count):
         source = sources[number % len(sources)]
         path = folder / f"damaged{source.suffix}"
         data = damaged(source.read_bytes(), rng)
         path.write_bytes(sealed(data) if source.suffix == ".e57" and rng.random() < 0.8 else data)
+        before_mb = peak_mb()
         try:
             cloud = open_cloud(path)
             end = "read"
@@ -89,8 +95,9 @@ def read_all(folder, count, rng):
             end = "FAULT"
             faults.append(f"{source.name} {number}: {type(error).__name__}: {error}")
             (folder / f"fault-{number}{source.suffix}").write_bytes(path.read_bytes())
+        largest_mb = max(largest_mb, peak_mb() - before_mb)
         ends[f"{source.suffix} {end}"] = ends.get(f"{source.suffix} {end}", 0) + 1
-    return ends, faults
+    return ends, faults, largest_mb
 
 
 if __name__ == "__main__":
@@ -98,7 +105,5 @@ if __name__ == "__main__":
     assert sealed(whole := (folder / "whole.e57").read_bytes()) == whole
     for path in folder.glob("whole.*"):  # what reading takes anyway is not counted
         open_cloud(path)
-    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    ends, faults = read_all(folder, count, random.Random(seed))
-    more_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb) / 1024
-    print(json.dumps({"ends": ends, "faults": faults[:20], "more_mb": more_mb}))
+    ends, faults, largest_mb = read_all(folder, count, random.Random(seed))
+    print(json.dumps({"ends": ends, "faults": faults[:20], "largest_mb": largest_mb}))

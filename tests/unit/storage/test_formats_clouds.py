@@ -347,7 +347,7 @@ def fuzz(folder, count, seed):
     assert done.returncode == 0, done.stderr[-2000:]
     told = json.loads(done.stdout)
     assert told["faults"] == []
-    assert told["more_mb"] <= 64
+    assert told["largest_mb"] <= 64
     assert sum(told["ends"].values()) == count
     return told["ends"]
 
