@@ -1,6 +1,6 @@
 """A session as its record tells it: rebuilt, judged and hashed without a service; changes nothing in the record."""
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,7 @@ from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.withdrawals import withdrawn_passes
 from scanner_service.storage.exports.about import About
 from scanner_service.storage.reader import RecordReader
-from scanner_service.storage.rows import SessionRow
+from scanner_service.storage.rows import EventRow, SessionRow
 
 OnShare = Callable[[float], object]
 MOST_STAGES = 12
@@ -96,13 +96,20 @@ def find_session(reader: RecordReader, wanted: str) -> SessionRow:
     )
 
 
-def lines_of(reader: RecordReader, row: SessionRow, damaged: list[str], on_share: OnShare) -> Iterator[StoredLine]:
-    """The lines of a session in order; what cannot be read goes to `damaged`, the share that was read to `on_share`."""
-    total = reader.count(row.session_id).lines
+def ends_of_scans(events: Iterable[EventRow]) -> list[int]:
+    """After how many lines of the session everything scanned up to then was closed, in order."""
+    return [event.line_number for event in events if event.kind in ("losses", "service_ended") and not event.damaged]
+
+
+def lines_of(
+    reader: RecordReader, row: SessionRow, damaged: list[str], on_share: OnShare
+) -> Iterator[tuple[int, StoredLine]]:
+    """The sound lines of a session with their numbers; the others go to `damaged`, the share read to `on_share`."""
+    total = max(reader.count(row.session_id).lines, 1)
     for number, line in reader.lines(
         row.session_id, on_damage=lambda found: damaged.append(f"line {found.line_number}: {found.reason}")
     ):
-        yield line
+        yield number, line
         on_share((number + 1) / total)
 
 
@@ -117,7 +124,8 @@ def read_session(
     AnalysisError : the lines do not fit the map that the settings describe.
     """
     settings = SessionSettings.from_dict(row.settings)
-    withdrawn = withdrawn_passes(reader.events(row.session_id))
+    events = list(reader.events(row.session_id))
+    withdrawn, scan_ends = withdrawn_passes(events), ends_of_scans(events)
     live_map = LiveMap(settings.map_settings(), np.array(row.origin_mm))
     damaged: list[str] = []
     ledger, raw = Ledger(), RawHash()
@@ -127,7 +135,10 @@ def read_session(
     kept = set(_evenly(ends[:-1], MOST_STAGES - 1))
     open_passes: dict[str, PassKey] = {}
     try:
-        for line in lines_of(reader, row, damaged, on_share):
+        for number, line in lines_of(reader, row, damaged, on_share):
+            while scan_ends and scan_ends[0] <= number:
+                scan_ends.pop(0)
+                live_map.close_all_passes()
             over = open_passes.get(line.device_id)
             if over is not None and over != pass_key(line):
                 live_map.close_pass(over)
@@ -138,14 +149,13 @@ def read_session(
                     stages.append(_stage((over,), raw.lines, found))
                     first = first or found
             open_passes[line.device_id] = pass_key(line)
-            ledger.arrived()
             ledger.mapped(line, live_map.add(line))
-            ledger.decided("stored")
             raw.add(line)
         live_map.close_all_passes()
         for key in withdrawn:
             if points := live_map.withdraw_pass(key):
                 ledger.withdrawn(points)
+        ledger.received = ledger.stored = raw.lines
         results = judge(live_map.snapshot(), settings.requirement())
     finally:
         live_map.close()
@@ -168,7 +178,7 @@ def pass_ends(reader: RecordReader, row: SessionRow, withdrawn: Collection[PassK
     """How many lines there were at the end of each pass that stands; the last is how many there are."""
     ends, total = [], 0
     open_passes: dict[str, PassKey] = {}
-    for line in lines_of(reader, row, [], lambda share: None):
+    for _, line in lines_of(reader, row, [], lambda share: None):
         over = open_passes.get(line.device_id)
         if over is not None and over != pass_key(line) and over not in withdrawn:
             ends.append(total)

@@ -18,7 +18,7 @@ from scanner_service.analysis.radius import line_radius, point_spacing_mm
 from scanner_service.analysis.snapshot import RadiusRule
 from scanner_service.sessions.fingerprint import RawHash
 from scanner_service.sessions.settings import SessionSettings
-from scanner_service.sessions.stored import OnShare
+from scanner_service.sessions.stored import OnShare, ends_of_scans, lines_of
 from scanner_service.sessions.withdrawals import withdrawn_passes
 from scanner_service.storage.exports.errors import NotExportable
 from scanner_service.storage.exports.point_stream import BLOCK_POINTS, Int64Array, PointBlock, PointStream, rows_of
@@ -32,7 +32,7 @@ _NO_XYZ, _NO_INDEX = np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
 
 @dataclass(frozen=True, slots=True)
 class _Head:
-    """A line without its points: where they lie, and the radius that they have in common."""
+    """A line without its points: where they lie, their common radius, and whether a scan ended just before it."""
 
     number: int
     line: StoredLine
@@ -40,6 +40,7 @@ class _Head:
     high_q: Int64Array
     radius_mm: float
     rule: RadiusRule
+    after_an_end: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +69,17 @@ def read_in_tiles(
             "the session has one radius for the whole cloud, which cannot be told from parts of it: "
             f"allow more than {points_at_once} points at once"
         )
+    events = list(reader.events(row.session_id))
+    withdrawn, scan_ends = withdrawn_passes(events), ends_of_scans(events)
     heads: list[_Head] = []
     damaged: list[str] = []
     bins: list[Counter[int]] = [Counter(), Counter(), Counter()]
     raw = RawHash()
     total = 0
-    for number, line in _numbered(reader, row, damaged, on_share):
-        heads.append(_head(number, line, settings))
+    for number, line in lines_of(reader, row, damaged, on_share):
+        ended = [count for count in scan_ends if count <= number]
+        scan_ends = scan_ends[len(ended) :]
+        heads.append(_head(number, line, settings, after_an_end=bool(ended)))
         for axis, counted in enumerate(bins):
             for place, count in zip(*np.unique(line.xyz_q[:, axis] // _BIN_Q, return_counts=True), strict=True):
                 counted[int(place)] += int(count)
@@ -84,7 +89,6 @@ def read_in_tiles(
     margin_q = math.ceil(margin_mm / QUANTUM_MM) + 1
     axis = max(range(3), key=lambda one: len(bins[one]))
     slabs = _slabs(bins[axis], -(-margin_q // _BIN_Q), points_at_once)
-    withdrawn = withdrawn_passes(reader.events(row.session_id))
 
     def blocks() -> Iterator[PointBlock]:
         for first_bin, end_bin, most in slabs:
@@ -105,26 +109,14 @@ def read_in_tiles(
     return TiledSession(stream, raw.hexdigest(), len(heads), tuple(damaged), len(slabs))
 
 
-def _numbered(
-    reader: RecordReader, row: SessionRow, damaged: list[str], on_share: OnShare
-) -> Iterator[tuple[int, StoredLine]]:
-    """The sound lines with their numbers."""
-    total = max(reader.count(row.session_id).lines, 1)
-    for number, line in reader.lines(
-        row.session_id, on_damage=lambda found: damaged.append(f"line {found.line_number}: {found.reason}")
-    ):
-        yield number, line
-        on_share((number + 1) / total)
-
-
-def _head(number: int, line: StoredLine, settings: SessionSettings) -> _Head:
+def _head(number: int, line: StoredLine, settings: SessionSettings, after_an_end: bool) -> _Head:
     spacing = point_spacing_mm(line.xyz_q, line.index)
     radius_mm, rule = line_radius(line.line_spacing_mm, spacing, settings.map_settings().radius)
     has_points = len(line.index) > 0
     low = line.xyz_q.min(axis=0).astype(np.int64) if has_points else np.ones(3, dtype=np.int64)
     high = line.xyz_q.max(axis=0).astype(np.int64) if has_points else np.zeros(3, dtype=np.int64)
     bare = replace(line, xyz_q=_NO_XYZ.copy(), index=_NO_INDEX.copy())
-    return _Head(number, bare, low, high, radius_mm, rule)
+    return _Head(number, bare, low, high, radius_mm, rule, after_an_end)
 
 
 def _slabs(bins: Counter[int], margin: int, points_at_once: int) -> list[tuple[int, int, int]]:
@@ -162,6 +154,8 @@ def _slab(
     open_passes: dict[str, PassKey] = {}
     try:
         for head in heads:
+            if head.after_an_end:
+                live_map.close_all_passes()
             line = head.line
             if head.number in wanted:
                 whole = next(lines)

@@ -39,8 +39,10 @@ def recorded(path, settings, withdraw=False):
     lines += surface_scan(height, lines=12, points=40, spacing=0.3, along=0.5, pass_index=2, boot_id=3, rng=rng)
     with Record.open(path) as record:
         row = record.create_session("s", state="stopped", settings=settings.to_dict(), origin_mm=(5.0, 0.25, -3.0))
-        for line in lines:
+        for number, line in enumerate(lines):
             record.append(row.session_id, line).result(10)
+            if number == 20:  # a scan that ended within its pass, and went on
+                record.append_event(row.session_id, "losses", {}).result(10)
         if withdraw:
             named = {"device_id": "A", "boot_id": 2, "pass_index": 1}
             record.append_event(row.session_id, "pass_withdrawn", named).result(10)
