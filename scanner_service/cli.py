@@ -12,8 +12,10 @@ from scanner_service.commands.bench import bench_app
 from scanner_service.commands.compare import compare_command
 from scanner_service.commands.demo import demo_command
 from scanner_service.commands.devices import devices_command, doctor_command
+from scanner_service.commands.export import export_command, verify_command
 from scanner_service.commands.open_viewer import open_command
 from scanner_service.commands.replay import replay_command
+from scanner_service.commands.report import report_command
 from scanner_service.commands.scan import scan_command
 from scanner_service.commands.serve import DEFAULT_DATA, serve_command
 from scanner_service.commands.sessions import sessions_app
@@ -35,6 +37,9 @@ app.command("doctor")(doctor_command)
 app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)
 app.command("compare")(compare_command)
+app.command("export")(export_command)
+app.command("report")(report_command)
+app.command("verify")(verify_command)
 app.command("simulate")(simulate_command)
 app.add_typer(sessions_app, name="sessions")
 app.add_typer(bench_app, name="bench")

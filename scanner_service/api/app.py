@@ -15,7 +15,7 @@ from scanner_service.api.guard import Guard, GuardRules
 from scanner_service.api.login import login_router
 from scanner_service.api.origins import Allowlist
 from scanner_service.api.problems import Problem, ProblemTable, register_problems
-from scanner_service.api.routes import analyses, health, live, results, scanlines, sessions
+from scanner_service.api.routes import analyses, exports, health, live, results, scanlines, sessions
 from scanner_service.api.scopes import Scoped, check_every_route_declares_a_scope, public
 from scanner_service.api.service import Service
 from scanner_service.rescan.requirement import RequirementUnusable
@@ -31,7 +31,7 @@ from scanner_service.sessions.errors import (
     SourceUnusable,
 )
 from scanner_service.storage.errors import CreationKeyReused, RecordBusy, RecordError, SessionUnknown
-from scanner_service.storage.exports.errors import ExportError
+from scanner_service.storage.exports.errors import ExportError, ExtraMissing, FormatNotWritten
 from scanner_service.storage.formats.errors import FormatError
 
 SESSION_PROBLEMS: ProblemTable = {
@@ -62,6 +62,8 @@ SESSION_PROBLEMS: ProblemTable = {
     RequirementUnusable: Problem(422, "requirement-unusable", "No scan could be judged by this"),
     ValueUnusable: Problem(422, "invalid-value", "A value cannot be used"),
     ExportUnknown: Problem(404, "export-unknown", "There is no such export"),
+    FormatNotWritten: Problem(422, "format-unknown", "There is no such format"),
+    ExtraMissing: Problem(501, "format-not-installed", "The format needs a library that is not installed"),
     ExportError: Problem(507, "export-failed", "The file could not be written"),
 }
 PUSH_BODY_BYTES = 4 << 20
@@ -79,7 +81,7 @@ def make_app(service: Service, allowlist: Allowlist | None = None) -> ASGIApp:
     register_problems(app, problems)
     install_docs(app, problems.values())
     app.include_router(login_router())
-    for module in (health, sessions, scanlines, results, live, analyses):
+    for module in (health, sessions, scanlines, results, exports, live, analyses):
         app.include_router(module.router)
 
     @app.get("/", dependencies=[Depends(public)], include_in_schema=False)

@@ -14,9 +14,11 @@ from scanner_service.api.metrics import metrics_of
 from scanner_service.sessions.analyses import AnalysisBook
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SessionError
+from scanner_service.sessions.export_desk import ExportDesk
 from scanner_service.sessions.readiness import kernels_are_ready, warm_up
 from scanner_service.sessions.retention import Retention
 from scanner_service.storage.errors import RecordError
+from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import Limits
 
@@ -32,6 +34,7 @@ class Service:
     access: Access
     replay_dir: Path
     metrics: CollectorRegistry
+    exports: ExportDesk
     closing: threading.Event
     analyses: AnalysisBook = field(default_factory=AnalysisBook)
 
@@ -61,11 +64,14 @@ class Service:
         try:
             book = SessionBook(record, retention)
             access = Access.open(data_dir, time.monotonic, secrets.token_bytes)
+            exports = ExportDesk(
+                data_dir / "exports", lambda: RecordReader.open(record_at or data_dir / "record.sqlite")
+            )
         except BaseException:
             record.close()
             raise
         threading.Thread(target=warm_up, name="warm-up", daemon=True).start()
-        service = cls(book, access, replay_dir, metrics_of(book), threading.Event())
+        service = cls(book, access, replay_dir, metrics_of(book), exports, threading.Event())
         threading.Thread(target=service._keep_to_the_retention, name="retention", daemon=True).start()
         return service
 
@@ -84,6 +90,7 @@ class Service:
         self.closing.set()
         self.analyses.close()
         try:
+            self.exports.close()
             self.book.close()
         finally:
             self.book.record.close()

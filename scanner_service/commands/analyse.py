@@ -28,7 +28,7 @@ NO_REGIONS = "a plain cloud has no scanlines, so it cannot be told where the sca
 
 
 def analyse_command(
-    file: Annotated[Path, typer.Argument(help="PLY, XYZ or CSV; with --method also a record.")],
+    file: Annotated[Path, typer.Argument(help="PLY, PCD, LAS, LAZ, E57, XYZ or CSV; with --method also a record.")],
     out: Annotated[Path, typer.Option(help="Folder for the result files.")] = Path("out"),
     radius: Annotated[float | None, typer.Option(help="One radius in mm for all points.")] = None,
     rule: Annotated[str | None, typer.Option(help="fixed, flexible (20 points each) or global (median).")] = None,

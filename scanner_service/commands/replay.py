@@ -19,6 +19,7 @@ from scanner_service.commands.terminal import (
     show_json,
 )
 from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.outputs import OUTPUT_FILES, write_outputs
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
@@ -81,6 +82,8 @@ def replay_command(
             play(live, quiet=as_json)
             summary = write_outputs(out, live)
             results = live.results()
+            if results is not None:
+                summary["verdict_sha256"] = verdict_sha256(results)
         if as_json:
             show_json(summary)
         elif results is not None:
@@ -114,6 +117,7 @@ def tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
         f"({summary['coverage']['gap_mm2']:,.0f} mm² of gaps)",
         highlight=False,
     )
+    console.print(f"SHA-256 of the verdict: {summary['verdict_sha256']}", highlight=False, soft_wrap=True)
     console.print(f"Written to {out}: {', '.join(OUTPUT_FILES)}", highlight=False, soft_wrap=True)
 
 

@@ -9,7 +9,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, Select, func, select, text
+from sqlalchemy import Connection, Engine, Select, Table, func, select, text
 from sqlalchemy.exc import DBAPIError
 
 from scanner_service.analysis.intake import StoredLine
@@ -28,7 +28,17 @@ from scanner_service.storage.rows import (
     Verification,
     Watermark,
 )
-from scanner_service.storage.tables import SCHEMA_VERSION, events, from_json, ledgers, lines, notes, row_crc, sessions
+from scanner_service.storage.tables import (
+    SCHEMA_VERSION,
+    events,
+    from_json,
+    ledgers,
+    lines,
+    metadata,
+    notes,
+    row_crc,
+    sessions,
+)
 from scanner_service.storage.tail import load_count, load_tail
 
 _LINES_A_CHUNK = 32
@@ -147,6 +157,16 @@ class RecordReader:
         end = self.count(session_id).lines
         return self._lines(session_id, max(start, 0), end if stop is None else min(stop, end), on_damage)
 
+    def stored_rows(self, session_id: str) -> Iterator[tuple[Table, list[dict[str, Any]]]]:
+        """Every row of a session as it is stored, damaged or not: table by table, lines in chunks; for copies.
+
+        Raises
+        ------
+        SessionUnknown : at once.
+        """
+        self.get_session(session_id)
+        return self._stored_rows(session_id)
+
     def verify(self, session_id: str) -> Verification:
         """Read everything of a session, and the structure of the whole file, and say what is damaged."""
         damaged: list[DamagedLine] = []
@@ -170,6 +190,20 @@ class RecordReader:
             if rows != seen:
                 problems.append(f"{rows} {table.name} are in the table, {seen} in its index")
         return Verification(Count(sound_lines, points), tuple(damaged), tuple(problems))
+
+    def _stored_rows(self, session_id: str) -> Iterator[tuple[Table, list[dict[str, Any]]]]:
+        for table in metadata.sorted_tables:
+            if table is lines or "session_id" not in table.c:
+                continue
+            if self._schema < 2 and table not in (sessions, events):
+                continue  # a record of schema 1 has no others
+            if found := self._rows(select(table).where(table.c.session_id == session_id)):
+                yield table, found
+        last = -1
+        query = select(lines).where(lines.c.session_id == session_id).order_by(lines.c.line_number)
+        while chunk := self._rows(query.where(lines.c.line_number > last).limit(_LINES_A_CHUNK)):
+            yield lines, chunk
+            last = chunk[-1]["line_number"]
 
     def _structure(self) -> Iterator[str]:
         """What the database itself finds wrong with the file; a server looks after its own."""

@@ -2,6 +2,7 @@
 
 import { SCALES } from "./colours.js";
 import { byId, element } from "./element.js";
+import { ExportMenu } from "./exports.js";
 import { drawRuler, drawTriad } from "./gauges.js";
 import { listenToKeys } from "./keyboard.js";
 import { drawLegend } from "./legend.js";
@@ -11,14 +12,13 @@ import { pickPoint } from "./picking.js";
 import { PointCloud } from "./point_cloud.js";
 import { RegionOverlay } from "./region_overlay.js";
 import { SceneView } from "./scene_view.js";
-import { exportAddress, listSessions, pauseSession, resumeSession, startSession, stopSession } from "./service.js";
+import { listSessions, pauseSession, resumeSession, startSession, stopSession } from "./service.js";
 import { SessionPicker } from "./session_picker.js";
 import { OVER, SessionView } from "./session_view.js";
 
 const TROUBLE_MS = 15000;
 const SURVEY_MS = 1000;
 const CLICK_SLACK_PX = 4;
-const EXPORTS = { "points.ply": "points with normals, density and flags", "density.png": "density map as a picture", "regions.json": "rescan regions", "summary.json": "summary of the session" };
 
 const look = { rule: "density", scale: "viridis", range: [0, 1], autoRange: true, pointScale: 1 };
 let chosenRegion = null;
@@ -35,6 +35,7 @@ const marker = element("div.marker", { hidden: true, "aria-hidden": "true" });
 byId("view").append(marker);
 view.scene.add(cloud.object, overlay.group);
 
+const exports = new ExportMenu(byId("export-links"), byId("exports"));
 const picker = new SessionPicker({ onChoose: openSession, onMissing: (text) => notice(text), current: () => session.id });
 
 function openView() {
@@ -206,7 +207,7 @@ function openSession(chosen) {
   drawRegions(byId("regions"), byId("regions-count"), null, null, chooseRegion);
   byId("legend").hidden = true;
   byId("exports").hidden = false;
-  byId("export-links").replaceChildren(...Object.entries(EXPORTS).map(([file, text]) => element("li", {}, element("a", { href: exportAddress(chosen.id, file), download: file }, file, element("span", {}, text)))));
+  exports.open(chosen.id);
   view.invalidate();
 }
 
