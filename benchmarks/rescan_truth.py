@@ -3,8 +3,8 @@
 The surface is sampled densely, and for every sample the sensor is put where its laser plane holds the sample. Then each
 reason's truth is an inequality (`truth_of`):
 
-    visible       n·u > 0 and n·v > 0 (u, v: unit vectors to laser and camera), neither sight blocked, in the fan,
-                  z_low <= z <= z_high, station within the sweep
+    visible       n·u >= cos 80° and n·v > 0 (u, v: unit vectors to laser and camera), neither sight blocked, in the
+                  fan, z_low <= z <= z_high, station within the sweep
     Δs'           g·|t·m| / sqrt(1 - (n·m)²), g the gap between the two lines around the sample
     δp'           D·dα / |d·e|: the angle between rays times the distance, on the surface (d along the line, e across
                   the ray)
@@ -17,7 +17,8 @@ reason's truth is an inequality (`truth_of`):
                   part, within range
     noisy         visible, and the noise there above the limit
 
-ρ is the required density. `band_of` marks the samples within one radius of a sample of the other truth.
+Beyond 80° fewer than half of the rays return: such surface is a wall, and as good as hidden. ρ is the required density
+less 5 % (what a scan cannot tell). `band_of` marks the samples within one radius of a sample of the other truth.
 """
 
 from collections.abc import Callable
@@ -36,6 +37,8 @@ Ints = npt.NDArray[np.int64]
 
 _LIFT_MM = 0.01  # sights start this far off the surface: rays are cast in single precision
 _GRAZING = 0.5  # cosine of 60°
+_WALL = float(np.cos(np.radians(80.0)))
+_SLACK = 1.05
 REASONS = ("steep", "sparse", "lost_lines", "out_of_range", "shadow", "noisy")
 
 
@@ -124,7 +127,7 @@ class Sight:
     """What a sweep sees of each sample; arrays of n rows.
 
     `station_mm` is where the laser plane holds the sample, `angle_rad` its place in the fan, `lit` whether the laser
-    reaches it (turned to it, nothing in between), `camera` the same of the camera, `in_fan` and `in_range` whether
+    reaches it (turned to it by at least 10°, nothing in between), `camera` whether the camera does (at any angle), `in_fan` and `in_range` whether
     fan, sweep and measurement range hold it. `incidence_rad` is the angle of normal and laser ray, `stretch` =
     |t·m| / sqrt(1 - (n·m)²), `along_mm` the spacing δp' of the rays on the surface, `laser_mm` (n, 3) where the
     laser then stands.
@@ -181,7 +184,7 @@ def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> 
     distance = np.linalg.norm(to_laser, axis=1)
     to_laser = to_laser / distance[:, None]
     cosine = np.einsum("ij,ij->i", normals, to_laser)
-    lit = cosine > 0
+    lit = cosine >= _WALL
     lit[lit] = caster.is_free(lifted[lit], laser[lit])
     seen = np.einsum("ij,ij->i", normals, camera - points) > 0
     seen[seen] = caster.is_free(lifted[seen], camera[seen])
@@ -226,7 +229,7 @@ def truth_of(
     gap = sweep.stations_mm[after] - sweep.stations_mm[after - 1]
     missing = sweep.numbers[after] - sweep.numbers[after - 1] > 1
     with np.errstate(divide="ignore"):
-        is_thin = 1.0 / (gap * sight.stretch * sight.along_mm) < density_per_mm2
+        is_thin = 1.0 / (gap * sight.stretch * sight.along_mm) < density_per_mm2 / _SLACK
     lost = visible & missing & (gap > 1.5 * sweep.line_spacing_mm) & is_thin
     beyond = sight.stretch > np.sqrt(2.0) + constant_mm / sweep.line_spacing_mm
     steep = visible & ~lost & (beyond | (is_thin & (np.cos(sight.incidence_rad) < _GRAZING)))
@@ -244,7 +247,7 @@ def truth_of(
 def _shadow(caster: Caster, samples: Samples, sight: Sight, optics: Optics, sweep: Sweep) -> Bools:
     """Hidden surface with seen surface around it, not the end of the part."""
     hidden = sight.in_fan & sight.in_range & ~sight.visible
-    turned = np.cos(sight.incidence_rad) > 0
+    turned = np.cos(sight.incidence_rad) >= _WALL
     away = np.flatnonzero(hidden & ~turned)
     # past a wall that is turned away, the ray goes on to its foot, or leaves the part
     start = samples.points_mm[away] + _LIFT_MM * samples.normals[away]

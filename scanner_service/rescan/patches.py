@@ -123,6 +123,19 @@ def _near_edges(points_mm: Float64Array, connection_mm: Float64Array) -> IntArra
     return np.column_stack([first[near], second[near]]).astype(np.int64)
 
 
+def _halfway(strips: Strips, rows: IntArray) -> tuple[IntArray, IntArray]:
+    """Pairs of a point of the patch (rows, rising) and a neighbour on its surface that is not of it.
+
+    A point stands for the surface halfway to its neighbours: in its own line, and in the lines beside.
+    """
+    on_surface = np.where(np.isfinite(strips.width_mm[rows]), strips.link[rows], -1)
+    other = np.concatenate([strips.chain[rows], on_surface], axis=1).T.reshape(-1)
+    owner = np.tile(rows, 4)
+    mine = np.minimum(np.searchsorted(rows, other), len(rows) - 1)
+    outside = (other >= 0) & (rows[mine] != other)
+    return owner[outside], other[outside]
+
+
 def _region(
     snapshot: MapSnapshot,
     requirement: Requirement,
@@ -135,9 +148,13 @@ def _region(
     noise_mm: float | None,
 ) -> RescanRegion:
     """One patch of failing points."""
-    spacing = np.fmin(strips.nominal_point_spacing_mm[rows], connection_mm)
     one_pass = bool((strips.group[rows] == strips.group[rows[0]]).all())
-    patch = patch_of(snapshot.points_mm[rows], connection_mm, spacing, unfolded_mm[rows] if one_pass else None)
+    owner, other = _halfway(strips, rows)
+    points = np.concatenate([snapshot.points_mm[rows], 0.5 * (snapshot.points_mm[owner] + snapshot.points_mm[other])])
+    unfolded = np.concatenate([unfolded_mm[rows], 0.5 * (unfolded_mm[owner] + unfolded_mm[other])])
+    connection = np.concatenate([connection_mm, connection_mm[np.searchsorted(rows, owner)]])
+    spacing = np.fmin(strips.nominal_point_spacing_mm[np.concatenate([rows, owner])], connection)
+    patch = patch_of(points, connection, spacing, unfolded if one_pass else None)
     normal = mean_normal(snapshot.normals[rows])
     if np.isnan(normal).any():
         towards = snapshot.lines.laser_mm[snapshot.line[rows]].mean(axis=0) - patch.centroid_mm
