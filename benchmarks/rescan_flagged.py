@@ -3,7 +3,7 @@
 Visible surface is a graph over the scan: angle in the fan and station. There a region's outline is a polygon, and every
 sample that the laser lights is in it or not. What is hidden has no place there: a shadow's region is the ribbon that
 closes the hidden hollow, so a hidden sample is flagged when the ribbon is the first thing that is seen from it in some
-direction, no further away than the ribbon is wide; and a place of the ribbon is right when the surface that it closes
+direction, no further away than the ribbon is wide, or when it lies within a radius; and a place of the ribbon is right when the surface that it closes
 off, on either side and no further away, is truly hidden.
 """
 
@@ -156,6 +156,10 @@ def _ribbons(
     width = np.linalg.norm(edges - np.roll(edges, 1, axis=1), axis=2).max(axis=1)
     rng = np.random.default_rng(3)
     rows = np.flatnonzero(true)
+    dense = np.asarray(
+        trimesh.sample.sample_surface(ribbon, max(1, int(4 * ribbon.area / samples.area_mm2)), seed=7)[0]
+    )
+    closed[rows] = np.isfinite(cKDTree(dense).query(samples.points_mm[rows], distance_upper_bound=radius_mm)[0])
     for _ in range(_DIRECTIONS):
         left = rows[~closed[rows]]
         normal = samples.normals[left]

@@ -12,9 +12,9 @@ reason's truth is an inequality (`truth_of`):
     steep         visible, not lost, Δs'/g > sqrt(2) + c/Δs, or 1/(Δs'·δp') < ρ at an incidence of more than 60°
     sparse        visible, neither of these, 1/(Δs'·δp') < ρ
     out_of_range  visible but for z < z_low or z > z_high
-    shadow        in the fan and in range, not visible, and either lit but hidden from the camera, or turned to the
-                  laser and hidden by the part, or turned away from it while the ray just past the sample ends on the
-                  part, within range
+    shadow        in the fan and in range, not visible, and either n·u >= cos 80° (hidden from laser or camera by the
+                  part, or turned away from the camera), or, for a wall, whoever goes down along it away from the laser
+                  comes to surface with n·u >= cos 80° in range, and does not leave the part
     noisy         visible, and the noise there above the limit
 
 Beyond 80° fewer than half of the rays return: such surface is a wall, and as good as hidden. ρ is the required density
@@ -39,6 +39,7 @@ _LIFT_MM = 0.01  # sights start this far off the surface: rays are cast in singl
 _GRAZING = 0.5  # cosine of 60°
 _WALL = float(np.cos(np.radians(80.0)))
 _SLACK = 1.05
+_SLIDES = 4
 REASONS = ("steep", "sparse", "lost_lines", "out_of_range", "shadow", "noisy")
 
 
@@ -95,6 +96,7 @@ class Caster:
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         corners = np.asarray(mesh.triangles, dtype=np.float64)
+        self.normals: Floats = np.asarray(mesh.face_normals, dtype=np.float64)
         self._centre = corners.reshape(-1, 3).mean(axis=0)
         self._scene = rtcore_scene.EmbreeScene()
         self._triangles = EmbreeTriangles(self._scene, (corners - self._centre).astype(np.float32))
@@ -127,8 +129,8 @@ class Sight:
     """What a sweep sees of each sample; arrays of n rows.
 
     `station_mm` is where the laser plane holds the sample, `angle_rad` its place in the fan, `lit` whether the laser
-    reaches it (turned to it by at least 10°, nothing in between), `camera` whether the camera does (at any angle), `in_fan` and `in_range` whether
-    fan, sweep and measurement range hold it. `incidence_rad` is the angle of normal and laser ray, `stretch` =
+    reaches it (turned to it by at least 10°, nothing in between), `camera` whether the camera does (at any angle),
+    `in_fan` and `in_range` whether fan, sweep and measurement range hold it. `incidence_rad` is the angle of normal and laser ray, `stretch` =
     |t·m| / sqrt(1 - (n·m)²), `along_mm` the spacing δp' of the rays on the surface, `laser_mm` (n, 3) where the
     laser then stands.
     """
@@ -248,15 +250,26 @@ def _shadow(caster: Caster, samples: Samples, sight: Sight, optics: Optics, swee
     """Hidden surface with seen surface around it, not the end of the part."""
     hidden = sight.in_fan & sight.in_range & ~sight.visible
     turned = np.cos(sight.incidence_rad) >= _WALL
-    away = np.flatnonzero(hidden & ~turned)
-    # past a wall that is turned away, the ray goes on to its foot, or leaves the part
-    start = samples.points_mm[away] + _LIFT_MM * samples.normals[away]
-    ray = samples.points_mm[away] - sight.laser_mm[away]
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    foot = start + np.minimum(caster.distance_mm(start, ray), 1e6)[:, None] * ray
-    depth = _in_sensor(foot, scan_coordinates(foot, optics, sweep)[0], sweep)[:, 2]
     shadow = hidden & turned
-    shadow[away] = (depth >= optics.range_mm[0]) & (depth <= optics.range_mm[1])
+    left = np.flatnonzero(hidden & ~turned)
+    points, normals = samples.points_mm[left], samples.normals[left]
+    for _ in range(_SLIDES):
+        # down the wall, to surface that is turned to the laser, to another wall, or off the part
+        station = scan_coordinates(points, optics, sweep)[0]
+        laser = sweep.origin_mm + station[:, None] * sweep.travel + optics.laser_mm @ sweep.rotation.T
+        down = points - laser
+        down -= np.minimum(np.einsum("ij,ij->i", down, normals), 0.0)[:, None] * normals
+        down /= np.linalg.norm(down, axis=1, keepdims=True)
+        start = points + _LIFT_MM * normals
+        face, distance = caster.triangle(start, down), caster.distance_mm(start, down)
+        met = (face >= 0) & np.isfinite(distance)
+        left, face = left[met], face[met]
+        points, normals = start[met] + distance[met, None] * down[met], caster.normals[face]
+        to_laser = laser[met] - points
+        facing = np.einsum("ij,ij->i", normals, to_laser) >= _WALL * np.linalg.norm(to_laser, axis=1)
+        depth = _in_sensor(points, scan_coordinates(points, optics, sweep)[0], sweep)[:, 2]
+        shadow[left[facing]] = ((depth >= optics.range_mm[0]) & (depth <= optics.range_mm[1]))[facing]
+        left, points, normals = left[~facing], points[~facing], normals[~facing]
     return shadow
 
 

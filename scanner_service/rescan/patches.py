@@ -62,8 +62,7 @@ def patches(
     by_label = np.argsort(label, kind="stable")
     groups = np.split(rows[by_label], np.flatnonzero(np.diff(label[by_label])) + 1)
     np.maximum.at(connection, links[:, 0], span)
-    if steep:
-        np.maximum.at(connection, links[:, 1], span)
+    np.maximum.at(connection, links[:, 1], span)
     large = [
         _region(snapshot, requirement, strips, judgement, unfolded_mm, reason, group, connection[group], noise_mm)
         for group in groups
