@@ -2,9 +2,9 @@
 
 Visible surface is a graph over the scan: angle in the fan and station. There a region's outline is a polygon, and every
 sample that the laser lights is in it or not. What is hidden has no place there: a shadow's region is the ribbon that
-closes the hidden hollow, so a hidden sample is flagged when the ribbon is the first thing that is seen from it in some
-direction, no further away than the ribbon is wide, or when it lies within a radius; and a place of the ribbon is right when the surface that it closes
-off, on either side and no further away, is truly hidden.
+closes the hidden hollow. So a hidden sample is flagged when it lies within a radius of the ribbon, or when the ribbon
+is the first thing that is seen from it in some direction, no further away than the ribbon is wide. A place of the
+ribbon is right when the surface that it closes off, on either side and no further away, is truly hidden.
 """
 
 from collections.abc import Sequence

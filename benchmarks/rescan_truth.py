@@ -12,9 +12,9 @@ reason's truth is an inequality (`truth_of`):
     steep         visible, not lost, Δs'/g > sqrt(2) + c/Δs, or 1/(Δs'·δp') < ρ at an incidence of more than 60°
     sparse        visible, neither of these, 1/(Δs'·δp') < ρ
     out_of_range  visible but for z < z_low or z > z_high
-    shadow        in the fan and in range, not visible, and either n·u >= cos 80° (hidden from laser or camera by the
-                  part, or turned away from the camera), or, for a wall, whoever goes down along it away from the laser
-                  comes to surface with n·u >= cos 80° in range, and does not leave the part
+    shadow        in the fan and in range, not visible, but beside what is: in some direction one looks from it into the
+                  space between the laser and visible surface (so the end of the part is none, nor is a hole through
+                  it, nor a cavity that no gap in the scan betrays)
     noisy         visible, and the noise there above the limit
 
 Beyond 80° fewer than half of the rays return: such surface is a wall, and as good as hidden. ρ is the required density
@@ -39,7 +39,8 @@ _LIFT_MM = 0.01  # sights start this far off the surface: rays are cast in singl
 _GRAZING = 0.5  # cosine of 60°
 _WALL = float(np.cos(np.radians(80.0)))
 _SLACK = 1.05
-_SLIDES = 4
+_DIRECTIONS = 16
+_FAR_MM = 25.0  # how far a shadow's surface looks for the space beside it
 REASONS = ("steep", "sparse", "lost_lines", "out_of_range", "shadow", "noisy")
 
 
@@ -130,9 +131,9 @@ class Sight:
 
     `station_mm` is where the laser plane holds the sample, `angle_rad` its place in the fan, `lit` whether the laser
     reaches it (turned to it by at least 10°, nothing in between), `camera` whether the camera does (at any angle),
-    `in_fan` and `in_range` whether fan, sweep and measurement range hold it. `incidence_rad` is the angle of normal and laser ray, `stretch` =
-    |t·m| / sqrt(1 - (n·m)²), `along_mm` the spacing δp' of the rays on the surface, `laser_mm` (n, 3) where the
-    laser then stands.
+    `in_fan` and `in_range` whether fan, sweep and measurement range hold it. `incidence_rad` is the angle of normal and
+    laser ray, `stretch` = |t·m| / sqrt(1 - (n·m)²), `along_mm` the spacing δp' of the rays on the surface, `laser_mm`
+    (n, 3) where the laser then stands.
     """
 
     station_mm: Floats
@@ -191,7 +192,6 @@ def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> 
     seen = np.einsum("ij,ij->i", normals, camera - points) > 0
     seen[seen] = caster.is_free(lifted[seen], camera[seen])
     height = float(optics.laser_mm[2])
-    at_zero = optics.laser_mm[0] + (own[:, 0] - optics.laser_mm[0]) * height / (height - own[:, 2])
     within = (station >= sweep.stations_mm[0]) & (station <= sweep.stations_mm[-1])
     along_line = np.cross(normals, m)
     sine = np.linalg.norm(along_line, axis=1)
@@ -206,7 +206,7 @@ def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> 
         angle_rad=angle,
         lit=lit,
         camera=seen,
-        in_fan=(np.abs(at_zero) <= 0.5 * optics.field_of_view_mm) & within,
+        in_fan=_fan_holds(own, optics) & within,
         in_range=(own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1]),
         incidence_rad=np.arccos(np.clip(cosine, -1.0, 1.0)),
         stretch=np.nan_to_num(stretch, nan=np.inf),
@@ -247,30 +247,53 @@ def truth_of(
 
 
 def _shadow(caster: Caster, samples: Samples, sight: Sight, optics: Optics, sweep: Sweep) -> Bools:
-    """Hidden surface with seen surface around it, not the end of the part."""
-    hidden = sight.in_fan & sight.in_range & ~sight.visible
-    turned = np.cos(sight.incidence_rad) >= _WALL
-    shadow = hidden & turned
-    left = np.flatnonzero(hidden & ~turned)
-    points, normals = samples.points_mm[left], samples.normals[left]
-    for _ in range(_SLIDES):
-        # down the wall, to surface that is turned to the laser, to another wall, or off the part
-        station = scan_coordinates(points, optics, sweep)[0]
-        laser = sweep.origin_mm + station[:, None] * sweep.travel + optics.laser_mm @ sweep.rotation.T
-        down = points - laser
-        down -= np.minimum(np.einsum("ij,ij->i", down, normals), 0.0)[:, None] * normals
-        down /= np.linalg.norm(down, axis=1, keepdims=True)
-        start = points + _LIFT_MM * normals
-        face, distance = caster.triangle(start, down), caster.distance_mm(start, down)
-        met = (face >= 0) & np.isfinite(distance)
-        left, face = left[met], face[met]
-        points, normals = start[met] + distance[met, None] * down[met], caster.normals[face]
-        to_laser = laser[met] - points
-        facing = np.einsum("ij,ij->i", normals, to_laser) >= _WALL * np.linalg.norm(to_laser, axis=1)
-        depth = _in_sensor(points, scan_coordinates(points, optics, sweep)[0], sweep)[:, 2]
-        shadow[left[facing]] = ((depth >= optics.range_mm[0]) & (depth <= optics.range_mm[1]))[facing]
-        left, points, normals = left[~facing], points[~facing], normals[~facing]
+    """Hidden surface beside what is seen: from it one looks into the space between the laser and seen surface."""
+    shadow = np.zeros(len(samples), dtype=bool)
+    hidden = np.flatnonzero(sight.in_fan & sight.in_range & ~sight.visible)
+    rng = np.random.default_rng(2)
+    for number in range(_DIRECTIONS):
+        left = hidden[~shadow[hidden]]
+        normals = samples.normals[left]
+        way = rng.normal(size=(len(left), 3))
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        way = normals.copy() if number == 0 else way + 1.02 * normals
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        start = samples.points_mm[left] + _LIFT_MM * normals
+        free = np.minimum(caster.distance_mm(start, way), _FAR_MM)
+        for share in (0.1, 0.35, 0.65, 0.95):
+            open_ = ~shadow[left]
+            there = start[open_] + share * free[open_, None] * way[open_]
+            shadow[left[open_]] = _is_looked_through(caster, there, optics, sweep)
     return shadow
+
+
+def _is_looked_through(caster: Caster, places_mm: Floats, optics: Optics, sweep: Sweep) -> Bools:
+    """(n,) True for places in the air that the laser reaches, with seen surface behind."""
+    t = sweep.travel
+    station = scan_coordinates(places_mm, optics, sweep)[0]
+    base = sweep.origin_mm + station[:, None] * t
+    laser, camera = base + optics.laser_mm @ sweep.rotation.T, base + optics.camera_mm @ sweep.rotation.T
+    ray = places_mm - laser
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    distance, face = caster.distance_mm(laser, ray), caster.triangle(laser, ray)
+    past = np.isfinite(distance) & (face >= 0) & (distance > np.linalg.norm(places_mm - laser, axis=1))
+    past &= (station >= sweep.stations_mm[0]) & (station <= sweep.stations_mm[-1])
+    foot = laser[past] + distance[past, None] * ray[past]
+    normals = caster.normals[face[past]]
+    own = _in_sensor(foot, station[past], sweep)
+    seen = -np.einsum("ij,ij->i", normals, ray[past]) >= _WALL
+    seen &= (np.einsum("ij,ij->i", normals, camera[past] - foot) > 0) & _fan_holds(own, optics)
+    seen &= (own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1])
+    seen[seen] = caster.is_free((foot + _LIFT_MM * normals)[seen], camera[past][seen])
+    past[past] = seen
+    return past
+
+
+def _fan_holds(own_mm: Floats, optics: Optics) -> Bools:
+    """(n,) True for points (n, 3) of the sensor frame within the fan."""
+    height = float(optics.laser_mm[2])
+    at_zero = optics.laser_mm[0] + (own_mm[:, 0] - optics.laser_mm[0]) * height / (height - own_mm[:, 2])
+    return np.asarray(np.abs(at_zero) <= 0.5 * optics.field_of_view_mm)
 
 
 def band_of(samples: Samples, truth: Bools, radius_mm: float) -> Bools:
