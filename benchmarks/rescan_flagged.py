@@ -149,8 +149,9 @@ def _ribbons(
     ribbon = ribbon_of(regions)
     if ribbon is None:
         return closed, 0.0, 0.0
-    both = trimesh.util.concatenate([part, ribbon])
-    caster = Caster(both)
+    corners = np.concatenate([part.vertices, ribbon.vertices])
+    faces = np.concatenate([part.faces, np.asarray(ribbon.faces) + len(part.vertices)])
+    caster = Caster(trimesh.Trimesh(corners, faces, process=False))
     first = len(part.faces)
     edges = np.asarray(ribbon.vertices)[ribbon.faces]
     width = np.linalg.norm(edges - np.roll(edges, 1, axis=1), axis=2).max(axis=1)

@@ -11,29 +11,34 @@ _TOP = 64  # sides of a round thing
 
 def slab(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
     """A box between two corners."""
-    return trimesh.creation.box(bounds=np.array([low, high]))
+    mesh: trimesh.Trimesh = trimesh.creation.box(bounds=np.array([low, high]))
+    return mesh
 
 
 def prism_along_x(outline_yz: list[tuple[float, float]], x: tuple[float, float]) -> trimesh.Trimesh:
     """A convex outline in (y, z) drawn out along x."""
     corners = [(at, y, z) for at in x for y, z in outline_yz]
-    return trimesh.convex.convex_hull(np.array(corners, dtype=np.float64))
+    mesh: trimesh.Trimesh = trimesh.convex.convex_hull(np.array(corners, dtype=np.float64))
+    return mesh
 
 
 def prism_along_y(outline_xz: list[tuple[float, float]], y: tuple[float, float]) -> trimesh.Trimesh:
     """A convex outline in (x, z) drawn out along y."""
     corners = [(x, at, z) for at in y for x, z in outline_xz]
-    return trimesh.convex.convex_hull(np.array(corners, dtype=np.float64))
+    mesh: trimesh.Trimesh = trimesh.convex.convex_hull(np.array(corners, dtype=np.float64))
+    return mesh
 
 
 def join(*parts: trimesh.Trimesh) -> trimesh.Trimesh:
     """Their union."""
-    return trimesh.boolean.union(parts, engine="manifold")
+    mesh: trimesh.Trimesh = trimesh.boolean.union(parts, engine="manifold")
+    return mesh
 
 
 def cut(part: trimesh.Trimesh, *cutters: trimesh.Trimesh) -> trimesh.Trimesh:
     """The part without the cutters."""
-    return trimesh.boolean.difference([part, *cutters], engine="manifold")
+    mesh: trimesh.Trimesh = trimesh.boolean.difference([part, *cutters], engine="manifold")
+    return mesh
 
 
 def wedges() -> trimesh.Trimesh:
@@ -72,7 +77,7 @@ def bowl() -> trimesh.Trimesh:
     cones = []
     for x, y, radius in ((-8.0, 16.0, 12.0), (8.0, 44.0, 12.5)):
         cone = trimesh.creation.cone(radius=radius + 1.0, height=radius + 1.0, sections=96)
-        cone.apply_transform(trimesh.transformations.rotation_matrix(np.pi, (1, 0, 0)))
+        cone.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))  # the tip down
         cone.apply_translation((x, y, 1.0))
         cones.append(cone)
     return cut(plate, *cones)
@@ -95,7 +100,10 @@ def waves() -> trimesh.Trimesh:
     skirt = np.concatenate(
         [np.column_stack([rim, rim + count, along]), np.column_stack([along, rim + count, along + count])]
     )
-    return trimesh.Trimesh(np.concatenate([top, bottom]), np.concatenate([upper, upper[:, ::-1] + count, skirt]))
+    mesh: trimesh.Trimesh = trimesh.Trimesh(
+        np.concatenate([top, bottom]), np.concatenate([upper, upper[:, ::-1] + count, skirt])
+    )
+    return mesh
 
 
 def ball() -> trimesh.Trimesh:
@@ -118,7 +126,8 @@ _SCALES = {"fandisk.obj": 25.0, "gears.stl": 0.9, "featuretype.STL": 9.0}
 def mesh_from(path: Path) -> trimesh.Trimesh:
     """A mesh file at the size that suits the scanner, its middle over x = 0, its near side at y = 0, half as z = 0."""
     mesh = trimesh.load_mesh(path)
-    mesh.apply_scale(_SCALES.get(path.name, 40.0 / float(np.max(mesh.extents))))
+    scale = _SCALES.get(path.name, 40.0 / float(np.max(mesh.extents)))
+    mesh.apply_transform(np.diag([scale, scale, scale, 1.0]))
     low, high = mesh.bounds
     mesh.apply_translation(-np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2]))
     return mesh

@@ -285,8 +285,9 @@ def _is_looked_through(caster: Caster, places_mm: Floats, optics: Optics, sweep:
     seen &= (np.einsum("ij,ij->i", normals, camera[past] - foot) > 0) & _fan_holds(own, optics)
     seen &= (own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1])
     seen[seen] = caster.is_free((foot + _LIFT_MM * normals)[seen], camera[past][seen])
-    past[past] = seen
-    return past
+    looked = np.zeros(len(places_mm), dtype=np.bool_)
+    looked[np.flatnonzero(past)[seen]] = True
+    return looked
 
 
 def _fan_holds(own_mm: Floats, optics: Optics) -> Bools:

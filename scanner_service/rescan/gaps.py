@@ -31,9 +31,7 @@ from scanner_service.rescan.strips import Strips, in_a_row
 Pairs = tuple[IntArray, IntArray, Float64Array, IntArray]  # first and second rows, width_mm, lane
 
 _LEAST_SPACINGS = 3.0
-_FAR_BELOW = (
-    6.0  # radii from one end of a gap to the other beyond which both are on one flank only if both planes say so
-)
+_FAR_BELOW = 6.0  # radii: ends further apart are on one flank only if the planes of both say so
 _LOST = 3  # places without a return that are more than chance
 _FACING = 0.5  # cosine of the largest incidence at the foot of a shadow
 _RANGE_SHARE = 0.005  # share of the range within which a point is near its end, whatever the surface does

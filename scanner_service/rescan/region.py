@@ -59,9 +59,9 @@ class RescanRegion:
     `point_rows` (point_count,) are rows of the snapshot: the failing points, or a gap's ends.
 
     `number` is the place in the list of one report; `region_id` names the region as long as the session lives (0: not
-    followed, a report by itself). `confidence` is the share of trust in the verdict, 0 to 1. `line_spacing_mm`
-    is the largest spacing on the surface that the requirement allows there, NaN if unknown. `history` are the changes
-    of its status, the oldest first.
+    followed, a report by itself). `confidence` = (agreeing + 1) / (points + 2): how many of its points fail by their
+    own measurement, not by their neighbours' only. `line_spacing_mm` is the largest spacing on the surface that the
+    requirement allows there, NaN if unknown. `history` are the changes of its status, the oldest first.
     """
 
     number: int
@@ -123,6 +123,11 @@ def mean_normal(normals: Float64Array) -> Float64Array:
 def priority_of(deficit: float, area_mm2: float) -> float:
     """Share of the requirement that is missing, times how large the area is beside 25 mm²."""
     return max(0.0, min(1.0, deficit)) * area_mm2 / (area_mm2 + _HALF_PRIORITY_MM2)
+
+
+def succession(agreeing: int, witnesses: int) -> float:
+    """Trust in a verdict on which so many of the witnesses agree (Laplace's rule of succession, 1774)."""
+    return (agreeing + 1.0) / (witnesses + 2.0)
 
 
 def _known(value: float) -> float | None:

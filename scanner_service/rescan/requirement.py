@@ -1,7 +1,9 @@
 """What a scan must reach before it is called good; knows numbers only, no points and no map."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from math import degrees, isfinite, pi
+from typing import Any
 
 import numpy as np
 
@@ -131,6 +133,18 @@ class Requirement:
                 f"region_area_mm2 is {self.region_area_mm2:g} mm², more than the surface of the region of interest: "
                 "nothing could ever be reported; lower it or enlarge the region of interest"
             )
+
+    def to_dict(self) -> dict[str, Any]:
+        """What the user set, for JSON and the record; None for what is not asked for."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Requirement":
+        """As `to_dict` gave it; names that this version does not know raise TypeError."""
+        interest = values.get("interest")
+        if interest is not None:
+            interest = Interest(tuple(interest["low_mm"]), tuple(interest["high_mm"]))
+        return cls(**{**values, "interest": interest})
 
     def check_scanner(self, noise_mm: float) -> None:
         """Refuse what a scanner of this noise (one standard deviation) cannot reach.

@@ -180,7 +180,7 @@ def settled_kinds(snapshot: MapSnapshot, strips: Strips, gaps: Gaps) -> Gaps:
     rungs = rungs_of(snapshot, strips, gaps, rows)
     length = gap_lengths_mm(snapshot, gaps, rows)
     of_flank = np.bincount(rungs.of_gap, weights=length * (gaps.kind[rows] == GapKind.FLANK), minlength=len(rungs))
-    flank = 2.0 * of_flank >= np.bincount(rungs.of_gap, weights=length, minlength=len(rungs))
+    flank = 4.0 * of_flank >= np.bincount(rungs.of_gap, weights=length, minlength=len(rungs))
     chains = chains_of(rungs)
     for chain in chains:
         flank[chain] = 2 * flank[chain].sum() > len(chain)
