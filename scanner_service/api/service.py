@@ -40,7 +40,7 @@ class Service:
         replay_dir.mkdir(exist_ok=True)
         record = Record.open(data_dir / "record.sqlite")
         try:
-            book = SessionBook(record)
+            book = SessionBook(record, replay_dir)
             access = Access.open(data_dir, time.monotonic, secrets.token_bytes)
         except BaseException:
             record.close()

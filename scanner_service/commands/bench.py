@@ -15,7 +15,7 @@ bench_app = typer.Typer(help="Measure how fast the service is, beside the tools 
 
 @bench_app.callback()
 def _bench() -> None:
-    """Keep `live-map` a command of its own, although there is no other yet."""
+    """Benchmarks are commands of their own."""
 
 
 @bench_app.command("live-map")
@@ -30,12 +30,7 @@ def live_map_command(
     warm_only: Annotated[bool, typer.Option("--warm-only", help="Leave the cold start out.")] = False,
 ) -> None:
     """Measure the live map and its peers by turns, print ratios, save JSON; takes some minutes."""
-    root = project_root()
-    if root is None:
-        fail(
-            "The benchmarks are not part of the installed package: clone the project and run "
-            "`scanner bench live-map` from there, installed with `pip install --editable '.[bench]'`."
-        )
+    root = _checkout("live-map")
     command = [sys.executable, "-m", "benchmarks.live_map", "--points", str(points), "--repeats", str(repeats)]
     command += ["--checks", str(checks)]
     if json_file is not None:
@@ -52,6 +47,36 @@ def live_map_command(
     done = subprocess.run(command, cwd=root, check=False)
     if done.returncode != 0:
         raise typer.Exit(1)
+
+
+@bench_app.command("rescan")
+def rescan_command(
+    json_file: Annotated[Path | None, typer.Option("--json", help="File for the figures.")] = None,
+    meshes: Annotated[Path | None, typer.Option(help="Folder with fandisk.obj, gears.stl, featuretype.STL.")] = None,
+    part: Annotated[str | None, typer.Option(help="One part only.")] = None,
+    spacing: Annotated[float, typer.Option(min=0.05, help="Distance of the truth's samples, mm.")] = 0.15,
+) -> None:
+    """Compare the area of rescan regions with the truth, by reason: recall and precision; takes some minutes."""
+    root = _checkout("rescan")
+    command = [sys.executable, "-m", "benchmarks.rescan", "--spacing", str(spacing)]
+    for name, value in (("--json", json_file), ("--meshes", meshes)):
+        if value is not None:
+            command += [name, str(value.absolute())]
+    if part is not None:
+        command += ["--part", part]
+    if subprocess.run(command, cwd=root, check=False).returncode != 0:
+        raise typer.Exit(1)
+
+
+def _checkout(name: str) -> Path:
+    """The checkout that the benchmark lies in; ends the command when there is none."""
+    root = project_root()
+    if root is None:
+        fail(
+            "The benchmarks are not part of the installed package: clone the project and run "
+            f"`scanner bench {name}` from there, installed with `pip install --editable '.[bench]'`."
+        )
+    return root
 
 
 def project_root() -> Path | None:

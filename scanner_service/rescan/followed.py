@@ -6,20 +6,23 @@ on its cubes are settled, unless something of its points was not judged again; u
 change is a moment of its history. Knows no session and no record.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from drivers.scanline import BoolArray
 from scanner_service.analysis.snapshot import MapSnapshot
-from scanner_service.rescan.judgement import Reason
+from scanner_service.rescan.judgement import REMEDIES, Reason
 from scanner_service.rescan.region import RegionMoment, RegionStatus, RescanRegion
 from scanner_service.rescan.stations import IntArray
 
 _CUBE_MM = 1.5
 _OVER = 0.1  # share of a region's cubes that a later pass must touch before the region counts as rescanned
 _MOST_MOMENTS = 64
+_KEPT_CUBES = 40
 _MOST_RESOLVED = 1000
 
 
@@ -111,6 +114,66 @@ class RegionBook:
         if old.region.status is not status or (old.region.history and old.region.history[-1].why != why):
             self._known[region_id] = _stepped(region_id, old, status, why, max(self._version, 0), changes)
         return changes
+
+    def to_dict(self) -> dict[str, Any]:
+        """What a later book needs to go on with the same ids, as JSON; cubes are thinned to a few a region."""
+        entries = [
+            {
+                "id": known_id,
+                "reason": known.region.reason.label,
+                "passes": sorted(known.passes),
+                "cubes": sorted(known.cubes)[:: max(1, len(known.cubes) // _KEPT_CUBES)],
+                "history": [moment.to_dict() for moment in known.region.history],
+            }
+            for known_id, known in (*self._known.items(), *self._resolved.items())
+        ]
+        return {"next": self._next, "regions": entries}
+
+    @classmethod
+    def from_dict(cls, kept: Mapping[str, Any]) -> "RegionBook":
+        """A book that goes on where another was kept; its regions have no outline until the next report.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError : it was not kept by `to_dict`.
+        """
+        book = cls()
+        book._next = int(kept["next"])
+        for entry in kept["regions"]:
+            history = tuple(
+                RegionMoment(
+                    int(moment["version"]),
+                    RegionStatus(moment["status"]),
+                    float(moment["area_mm2"]),
+                    float(moment["priority"]),
+                    str(moment["why"]),
+                )
+                for moment in entry["history"]
+            )
+            last = history[-1]
+            cubes = {(int(x), int(y), int(z)) for x, y, z in entry["cubes"]}
+            reason = Reason[str(entry["reason"]).upper()]
+            region = RescanRegion(
+                number=0,
+                reason=reason,
+                outline_mm=(),
+                area_mm2=last.area_mm2,
+                centroid_mm=(np.array(sorted(cubes), dtype=np.float64).mean(axis=0) + 0.5) * _CUBE_MM,
+                normal=np.full(3, np.nan),
+                measured_per_mm2=math.nan,
+                required_per_mm2=math.nan,
+                counting_error_per_mm2=math.nan,
+                priority=last.priority,
+                point_count=0,
+                remedy=REMEDIES[reason],
+                point_rows=np.zeros(0, dtype=np.int64),
+                region_id=int(entry["id"]),
+                status=last.status,
+                history=history,
+            )
+            known = _Known(region, cubes, frozenset(map(int, entry["passes"])))
+            (book._resolved if last.status is RegionStatus.RESOLVED else book._known)[region.region_id] = known
+        return book
 
     def _begun(
         self, region: RescanRegion, cubes: set[tuple[int, int, int]], passes: frozenset[int], changes: list[Change]

@@ -114,6 +114,8 @@ def judge(
     """
     line, n = snapshot.line, len(snapshot)
     required = requirement.per_mm2(strips.line_spacing_mm, strips.nominal_point_spacing_mm)
+    if requirement.density_per_mm2 is None:
+        required = _no_more_than_the_first_pass(required, strips)
     counted_density = border_aware(snapshot.side_density_per_mm2, snapshot.offset)
     judged = snapshot.settled & (snapshot.neighbours > 0) & np.isfinite(required)
     if requirement.interest is not None:
@@ -190,6 +192,19 @@ def judge(
     reason[below[(reason[below] == Reason.SPARSE) & ~failing[below].any(axis=1)]] = Reason.SHADOW
     reason[~judged] = Reason.NONE
     return Judgement(judged, reason, required, counted_density, worst, width, failing, grazing, noise, allowed)
+
+
+def _no_more_than_the_first_pass(required_per_mm2: Float64Array, strips: Strips) -> Float64Array:
+    """(n,) What is asked of later passes is bounded by what the first was asked: a finer pass must be able to mend."""
+    if not len(required_per_mm2):
+        return required_per_mm2
+    first = required_per_mm2[strips.group == strips.group[0]]
+    known = first[np.isfinite(first)]
+    return (
+        np.minimum(required_per_mm2, float(np.median(known)))
+        if len(known) and (first.size < strips.group.size)
+        else (required_per_mm2)
+    )
 
 
 def _allowed_by_rule(

@@ -171,10 +171,10 @@ def check_place(reference: ReferenceSurface, snapshot: MapSnapshot) -> bool:
         return False
     points = snapshot.points_mm[counted[:: max(1, len(counted) // _SAMPLE)]]
     radius = float(np.median(snapshot.radius_mm[counted]))
-    far_mm = max(_FAR_RADII * radius, _FAR_SHARE * reference.diagonal_mm)
+    far_mm = max(min(_FAR_RADII * radius, 0.1 * reference.diagonal_mm), _FAR_SHARE * reference.diagonal_mm)
     size = max(radius, reference.diagonal_mm / 400.0)
     away = float(np.median(cKDTree(reference.pieces(size).points_mm).query(points)[0]))
-    if away <= far_mm + size:
+    if away <= far_mm + min(size, far_mm):
         return True
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     for unit, factor in (("metres", 1000.0), ("inches", 25.4)):
@@ -198,7 +198,7 @@ def reference_coverage(
     radius = float(np.median(snapshot.radius_mm[counted])) if counted.any() else 1.0
     pieces = _inside(reference.pieces(radius), requirement.interest)
     good_point = report.judgement.judged & np.isin(report.reason, (Reason.NONE, Reason.SHADOW))
-    reach = pieces.size_mm + float(np.quantile(report.strips.reach_mm, 0.9) if len(snapshot) else 0.0)
+    reach = max(0.6 * pieces.size_mm, float(np.quantile(report.strips.reach_mm, 0.9)) if len(snapshot) else 0.0)
     touched = _reached(pieces, snapshot, counted, reach)
     good = touched & _reached(pieces, snapshot, good_point, reach)
     return ReferenceCoverage(

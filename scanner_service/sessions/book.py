@@ -4,13 +4,17 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
-from scanner_service.sessions.errors import SessionBusy
+from scanner_service.rescan.reference import ReferenceSurface, ReferenceUnusable
+from scanner_service.sessions.errors import SessionBusy, SourceUnusable
+from scanner_service.sessions.references import open_reference
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec, SourceSpec
 from scanner_service.sessions.sources import PushSource, Source, SpentSource
 from scanner_service.storage.errors import RecordError
+from scanner_service.storage.formats.errors import FormatError
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import SessionRow
 
@@ -21,8 +25,9 @@ MAX_LIVE = 16
 class SessionBook:
     """All sessions of one record; those that somebody looks at are held open."""
 
-    def __init__(self, record: Record) -> None:
+    def __init__(self, record: Record, meshes: Path | None = None) -> None:
         self.record = record
+        self._meshes = meshes  # the folder in which reference meshes lie
         self._live: dict[str, LiveSession] = {}
         self._lock = threading.RLock()
         for row in self._all_rows():
@@ -39,8 +44,11 @@ class SessionBook:
         settings: SessionSettings | None = None,
         origin_mm: Sequence[float] = (0.0, 0.0, 0.0),
         source: Source | None = None,
+        reference: ReferenceSurface | None = None,
     ) -> LiveSession:
         """Make a session and hold it open; `source` is the opened source when the caller has it already.
+
+        `reference` is the nominal part that the settings name.
 
         Raises
         ------
@@ -59,7 +67,7 @@ class SessionBook:
                     origin_mm=origin_mm,
                     source=spec.to_dict(),
                 )
-                return self._hold(LiveSession(row, self.record, opened))
+                return self._hold(LiveSession(row, self.record, opened, reference=reference))
             except BaseException:
                 opened.stop()
                 raise
@@ -82,7 +90,8 @@ class SessionBook:
             row = self.record.get_session(session_id)
             self._make_room()
             source: Source = PushSource() if row.source.get("kind") == PushSpec().to_dict()["kind"] else SpentSource()
-            return self._hold(LiveSession(row, self.record, source), on_progress)
+            live = LiveSession(row, self.record, source, reference=self._reference_of(row))
+            return self._hold(live, on_progress)
 
     def live(self, session_id: str) -> LiveSession | None:
         """The session if it is held open."""
@@ -110,6 +119,17 @@ class SessionBook:
             for live in self._live.values():
                 stack.callback(live.close)
             self._live = {}
+
+    def _reference_of(self, row: SessionRow) -> ReferenceSurface | None:
+        """The nominal part of a session that is opened again; None when there is none, or not the same any more."""
+        spec = SessionSettings.from_dict(row.settings).reference
+        if spec is None or self._meshes is None:
+            return None
+        try:
+            return open_reference(spec, self._meshes)[0]
+        except (FormatError, ReferenceUnusable, SourceUnusable) as error:
+            _LOG.warning("session %s is opened without its reference mesh: %s", row.session_id, error)
+            return None
 
     def _hold(self, session: LiveSession, on_progress: Callable[[int], None] = lambda lines: None) -> LiveSession:
         session.open(on_progress)

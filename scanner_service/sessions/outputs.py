@@ -28,16 +28,16 @@ def _points(path: Path, session: LiveSession, results: Results) -> None:
 def _density(path: Path, session: LiveSession, results: Results) -> None:
     picture = density_png(
         results.snapshot,
-        results.report.regions,
+        results.regions,
         session_name=session.row.name,
         when=session.row.created_utc[:16].replace("T", " ") + " UTC",
-        coverage=results.coverage.share,
+        coverage=results.share,
     )
     write_whole(path, picture)
 
 
 def _regions(path: Path, session: LiveSession, results: Results) -> None:
-    write_json(path, {"session": session.row.session_id, **results.report.to_dict()})
+    write_json(path, {"session": session.row.session_id, **results.regions_dict()})
 
 
 def _summary(path: Path, session: LiveSession, results: Results) -> None:

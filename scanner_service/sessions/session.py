@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,9 @@ from drivers.scanline import Scanline
 from scanner_service.analysis.errors import AnalysisError
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey
+from scanner_service.rescan.followed import RegionBook
+from scanner_service.rescan.reference import ReferenceSurface
+from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionBusy, SessionError
 from scanner_service.sessions.readiness import warm_up
@@ -29,6 +32,10 @@ from scanner_service.storage.rows import SessionRow, Stored
 _LOG = logging.getLogger(__name__)
 ANALYSIS_PERIOD_S = 1.0
 """Regions are looked for about this often during a scan, and less often when one search takes long."""
+
+REGIONS_CHANGED = "regions_changed"
+REGIONS_FOLLOWED = "regions_followed"
+"""Events: what became of regions at one verdict; and, when a scan is over, what a later opening goes on with."""
 
 STATES = ("created", "scanning", "paused", "interrupted", "stopped", "failed")
 
@@ -60,6 +67,7 @@ class LiveSession:
         record: Record,
         source: Source,
         clock: Callable[[], float] = time.monotonic,
+        reference: ReferenceSurface | None = None,
     ) -> None:
         self.row = row
         self.settings = SessionSettings.from_dict(row.settings)
@@ -71,6 +79,9 @@ class LiveSession:
         self._state = row.state
         self._message: str | None = None
         self._results: Results | None = None
+        self._reference = reference
+        self._regions = RegionBook()
+        self._following = threading.Lock()
         self._results_changed = threading.Condition()
         self._lock = threading.RLock()
         self._begun_s: float | None = None
@@ -98,6 +109,9 @@ class LiveSession:
             except (AnalysisError, ValueError) as error:
                 damaged.append(f"line {number}: {error}")
             on_progress(number)
+        for event in self._record.events(self.row.session_id):
+            if event.kind == REGIONS_FOLLOWED:
+                self._regions = RegionBook.from_dict(event.details)
         for key in withdrawn_passes(self._record.events(self.row.session_id)):
             self.engine.withdraw_pass(key)
         if damaged:
@@ -257,11 +271,11 @@ class LiveSession:
             lines=ledger.received,
             points=ledger.counted,
             points_per_s=ledger.counted / elapsed if elapsed > 0 else 0.0,
-            coverage=results.coverage.share if results is not None else float("nan"),
+            coverage=results.share if results is not None else float("nan"),
             progress=self.source.progress(),
             losses=self.losses(),
             durable=durable,
-            message=self.engine.failure or self._message,
+            message=self.engine.failure or self._message or (results.reference_refused if results else None),
         )
 
     # -- inside -------------------------------------------------------------------------------------------------
@@ -281,6 +295,8 @@ class LiveSession:
             self._ended_s = self._clock()
             self._judge()
             self._event("losses", self.losses())
+            with self._following:
+                self._event(REGIONS_FOLLOWED, self._regions.to_dict())
             if failure is not None or self._state == "paused":
                 self._message = failure  # a scan that is over waits for nothing
             self._set_state("failed" if failure is not None else "stopped")
@@ -308,7 +324,11 @@ class LiveSession:
             if unless is not None and self.engine.ask(lambda engine: engine.live_map.read_version()).result() == unless:
                 return self._results
             snapshot = self.engine.ask(lambda engine: engine.live_map.snapshot()).result()
-            results = judge(snapshot, self.settings.requirement(), self.source.geometry, self.source.towards_sensor)
+            source = self.source
+            results = judge(
+                snapshot, self.settings.requirement(), source.geometry, source.towards_sensor, self._reference
+            )
+            results = self._follow(results)
             self.engine.ask(
                 lambda engine: self.verdicts.replace(results.verdict, snapshot.version, engine.live_map)
             ).result()
@@ -319,6 +339,33 @@ class LiveSession:
                 self._results = results
             self._results_changed.notify_all()
         return results
+
+    def _follow(self, results: Results) -> Results:
+        """Give the regions the ids they have had, and keep what has changed of them in the record."""
+        with self._following:
+            changes = self._regions.follow(results.snapshot, results.regions)
+            followed = replace(results, regions=self._regions.current, resolved=self._regions.resolved)
+        if changes:
+            self._event(REGIONS_CHANGED, {"changes": [change.to_dict() for change in changes]})
+        return followed
+
+    def mark_region(self, region_id: int, status: RegionStatus, why: str) -> None:
+        """Say of a region that it is unreachable, or that it is not after all; kept in the record.
+
+        Raises
+        ------
+        SessionError : no such region is open.
+        """
+        with self._following:
+            try:
+                changes = self._regions.mark(region_id, status, why)
+            except KeyError:
+                raise SessionError(f"there is no open region {region_id} in this session") from None
+            results = self._results
+            if results is not None:
+                self._results = replace(results, regions=self._regions.current, resolved=self._regions.resolved)
+        if changes:
+            self._event(REGIONS_CHANGED, {"changes": [change.to_dict() for change in changes]})
 
     def _event(self, kind: str, details: dict[str, Any]) -> None:
         try:
