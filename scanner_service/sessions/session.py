@@ -19,6 +19,7 @@ from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionBusy, SessionError
+from scanner_service.sessions.mirror import Mirror, difference_since
 from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.settings import SessionSettings
@@ -82,6 +83,8 @@ class LiveSession:
         self._reference = reference
         self._regions = RegionBook()
         self._following = threading.Lock()
+        self._mirror = Mirror()
+        self._mirroring = threading.Lock()
         self._results_changed = threading.Condition()
         self._lock = threading.RLock()
         self._begun_s: float | None = None
@@ -323,7 +326,10 @@ class LiveSession:
         try:
             if unless is not None and self.engine.ask(lambda engine: engine.live_map.read_version()).result() == unless:
                 return self._results
-            snapshot = self.engine.ask(lambda engine: engine.live_map.snapshot()).result()
+            with self._mirroring:
+                since = self._mirror.version
+                change = self.engine.ask(lambda engine: difference_since(engine.live_map, since)).result()
+                snapshot = self._mirror.apply(change)
             source = self.source
             results = judge(
                 snapshot, self.settings.requirement(), source.geometry, source.towards_sensor, self._reference
