@@ -122,13 +122,13 @@ def agreements(
 ) -> dict[str, Agreement]:
     """Of each reason, how flagged and true area agree."""
     flagged = flagged_visible(regions, samples, sight, optics, sweep)
-    hidden, right, ribbon_mm2 = _ribbons(regions, part, samples, truth["shadow"], radius_mm)
+    hidden, right, ribbon_mm2 = _ribbons(regions, part, samples, truth["shadow"], sight.grazing, radius_mm)
     anything = hidden.copy()
     for marks in flagged.values():
         anything |= marks
     found: dict[str, Agreement] = {}
     for reason, true in truth.items():
-        counted = ~band_of(samples, true, radius_mm)
+        counted = ~band_of(samples, true, radius_mm) & ~sight.grazing
         mine = hidden if reason == "shadow" else flagged.get(reason, np.zeros(len(samples), dtype=bool))
         area = samples.area_mm2
         found[reason] = Agreement(
@@ -142,7 +142,12 @@ def agreements(
 
 
 def _ribbons(
-    regions: Sequence[RescanRegion], part: trimesh.Trimesh, samples: Samples, true: Bools, radius_mm: float
+    regions: Sequence[RescanRegion],
+    part: trimesh.Trimesh,
+    samples: Samples,
+    true: Bools,
+    left_out: Bools,
+    radius_mm: float,
 ) -> tuple[Bools, float, float]:
     """Which hidden samples (n,) a ribbon closes off; area of the ribbons that is right, and area that was looked at."""
     closed = np.zeros(len(samples), dtype=bool)
@@ -176,7 +181,7 @@ def _ribbons(
     count = max(1, int(ribbon.area / samples.area_mm2))
     points, face = trimesh.sample.sample_surface(ribbon, count, seed=5)
     points, normals = np.asarray(points), np.asarray(ribbon.face_normals)[face]
-    surface, band = cKDTree(samples.points_mm), band_of(samples, true, radius_mm)
+    surface, band = cKDTree(samples.points_mm), band_of(samples, true, radius_mm) | left_out
     good, looked = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     solid = Caster(part)
     for side in (1.0, -1.0):

@@ -12,13 +12,14 @@ reason's truth is an inequality (`truth_of`):
     steep         visible, not lost, Δs'/g > sqrt(2) + c/Δs, or 1/(Δs'·δp') < ρ at an incidence of more than 60°
     sparse        visible, neither of these, 1/(Δs'·δp') < ρ
     out_of_range  visible but for z < z_low or z > z_high
-    shadow        in the fan and in range, not visible, but beside what is: in some direction one looks from it into the
-                  space between the laser and visible surface (so the end of the part is none, nor is a hole through
-                  it, nor a cavity that no gap in the scan betrays)
+    shadow        in the fan and in range, neither visible nor grazing, but beside what is: in some direction one looks
+                  from it into the space between the laser and visible surface that is no higher (so the end of the
+                  part is none, nor is a hole through it, nor a cavity that no gap in the scan betrays)
     noisy         visible, and the noise there above the limit
 
-Beyond 80° fewer than half of the rays return: such surface is a wall, and as good as hidden. ρ is the required density
-less 5 % (what a scan cannot tell). `band_of` marks the samples within one radius of a sample of the other truth.
+Beyond 80° fewer than half of the rays return: such `grazing` surface may be seen or not, and is left out. ρ is the
+required density less 5 % (what a scan cannot tell). `band_of` marks the samples within one radius of a sample of the
+other truth.
 """
 
 from collections.abc import Callable
@@ -39,7 +40,8 @@ _LIFT_MM = 0.01  # sights start this far off the surface: rays are cast in singl
 _GRAZING = 0.5  # cosine of 60°
 _WALL = float(np.cos(np.radians(80.0)))
 _SLACK = 1.05
-_DIRECTIONS = 16
+_DIRECTIONS = 40
+_HIGHER_MM = 0.4
 _FAR_MM = 25.0  # how far a shadow's surface looks for the space beside it
 REASONS = ("steep", "sparse", "lost_lines", "out_of_range", "shadow", "noisy")
 
@@ -131,6 +133,7 @@ class Sight:
 
     `station_mm` is where the laser plane holds the sample, `angle_rad` its place in the fan, `lit` whether the laser
     reaches it (turned to it by at least 10°, nothing in between), `camera` whether the camera does (at any angle),
+    `grazing` whether both do, but the laser at less than 10°,
     `in_fan` and `in_range` whether fan, sweep and measurement range hold it. `incidence_rad` is the angle of normal and
     laser ray, `stretch` = |t·m| / sqrt(1 - (n·m)²), `along_mm` the spacing δp' of the rays on the surface, `laser_mm`
     (n, 3) where the laser then stands.
@@ -140,6 +143,7 @@ class Sight:
     angle_rad: Floats
     lit: Bools
     camera: Bools
+    grazing: Bools
     in_fan: Bools
     in_range: Bools
     incidence_rad: Floats
@@ -187,8 +191,9 @@ def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> 
     distance = np.linalg.norm(to_laser, axis=1)
     to_laser = to_laser / distance[:, None]
     cosine = np.einsum("ij,ij->i", normals, to_laser)
-    lit = cosine >= _WALL
-    lit[lit] = caster.is_free(lifted[lit], laser[lit])
+    reached = cosine > 1e-6
+    reached[reached] = caster.is_free(lifted[reached], laser[reached])
+    lit = reached & (cosine >= _WALL)
     seen = np.einsum("ij,ij->i", normals, camera - points) > 0
     seen[seen] = caster.is_free(lifted[seen], camera[seen])
     height = float(optics.laser_mm[2])
@@ -206,6 +211,7 @@ def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> 
         angle_rad=angle,
         lit=lit,
         camera=seen,
+        grazing=reached & ~lit & seen,
         in_fan=_fan_holds(own, optics) & within,
         in_range=(own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1]),
         incidence_rad=np.arccos(np.clip(cosine, -1.0, 1.0)),
@@ -249,7 +255,8 @@ def truth_of(
 def _shadow(caster: Caster, samples: Samples, sight: Sight, optics: Optics, sweep: Sweep) -> Bools:
     """Hidden surface beside what is seen: from it one looks into the space between the laser and seen surface."""
     shadow = np.zeros(len(samples), dtype=bool)
-    hidden = np.flatnonzero(sight.in_fan & sight.in_range & ~sight.visible)
+    hidden = np.flatnonzero(sight.in_fan & sight.in_range & ~sight.visible & ~sight.grazing)
+    depth = _in_sensor(samples.points_mm, sight.station_mm, sweep)[:, 2]
     rng = np.random.default_rng(2)
     for number in range(_DIRECTIONS):
         left = hidden[~shadow[hidden]]
@@ -263,12 +270,12 @@ def _shadow(caster: Caster, samples: Samples, sight: Sight, optics: Optics, swee
         for share in (0.1, 0.35, 0.65, 0.95):
             open_ = ~shadow[left]
             there = start[open_] + share * free[open_, None] * way[open_]
-            shadow[left[open_]] = _is_looked_through(caster, there, optics, sweep)
+            shadow[left[open_]] = _is_looked_through(caster, there, depth[left[open_]], optics, sweep)
     return shadow
 
 
-def _is_looked_through(caster: Caster, places_mm: Floats, optics: Optics, sweep: Sweep) -> Bools:
-    """(n,) True for places in the air that the laser reaches, with seen surface behind."""
+def _is_looked_through(caster: Caster, places_mm: Floats, z_mm: Floats, optics: Optics, sweep: Sweep) -> Bools:
+    """(n,) True for places in the air that the laser reaches, with seen surface no higher than z (n,) behind."""
     t = sweep.travel
     station = scan_coordinates(places_mm, optics, sweep)[0]
     base = sweep.origin_mm + station[:, None] * t
@@ -283,7 +290,7 @@ def _is_looked_through(caster: Caster, places_mm: Floats, optics: Optics, sweep:
     own = _in_sensor(foot, station[past], sweep)
     seen = -np.einsum("ij,ij->i", normals, ray[past]) >= _WALL
     seen &= (np.einsum("ij,ij->i", normals, camera[past] - foot) > 0) & _fan_holds(own, optics)
-    seen &= (own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1])
+    seen &= (own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= np.minimum(optics.range_mm[1], z_mm[past] + _HIGHER_MM))
     seen[seen] = caster.is_free((foot + _LIFT_MM * normals)[seen], camera[past][seen])
     looked = np.zeros(len(places_mm), dtype=np.bool_)
     looked[np.flatnonzero(past)[seen]] = True
