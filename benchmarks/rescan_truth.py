@@ -13,8 +13,9 @@ reason's truth is an inequality (`truth_of`):
     sparse        visible, neither of these, 1/(Δs'·δp') < ρ
     out_of_range  visible but for z < z_low or z > z_high
     shadow        in the fan and in range, neither visible nor grazing, but beside what is: in some direction one looks
-                  from it into the space between the laser and visible surface that is no higher (so the end of the
-                  part is none, nor is a hole through it, nor a cavity that no gap in the scan betrays)
+                  from it into the space between the laser and visible surface (so the end of the part is none, nor is
+                  a cavity that no gap in the scan betrays; the walls of a hole right through are, as one looks up out
+                  of it, though no verdict calls them a shadow: they count as missed)
     noisy         visible, and the noise there above the limit
 
 Beyond 80° fewer than half of the rays return: such `grazing` surface may be seen or not, and is left out. ρ is the
@@ -40,8 +41,7 @@ _LIFT_MM = 0.01  # sights start this far off the surface: rays are cast in singl
 _GRAZING = 0.5  # cosine of 60°
 _WALL = float(np.cos(np.radians(80.0)))
 _SLACK = 1.05
-_DIRECTIONS = 40
-_HIGHER_MM = 0.4
+_DIRECTIONS = 32
 _FAR_MM = 25.0  # how far a shadow's surface looks for the space beside it
 REASONS = ("steep", "sparse", "lost_lines", "out_of_range", "shadow", "noisy")
 
@@ -256,7 +256,6 @@ def _shadow(caster: Caster, samples: Samples, sight: Sight, optics: Optics, swee
     """Hidden surface beside what is seen: from it one looks into the space between the laser and seen surface."""
     shadow = np.zeros(len(samples), dtype=bool)
     hidden = np.flatnonzero(sight.in_fan & sight.in_range & ~sight.visible & ~sight.grazing)
-    depth = _in_sensor(samples.points_mm, sight.station_mm, sweep)[:, 2]
     rng = np.random.default_rng(2)
     for number in range(_DIRECTIONS):
         left = hidden[~shadow[hidden]]
@@ -270,12 +269,12 @@ def _shadow(caster: Caster, samples: Samples, sight: Sight, optics: Optics, swee
         for share in (0.1, 0.35, 0.65, 0.95):
             open_ = ~shadow[left]
             there = start[open_] + share * free[open_, None] * way[open_]
-            shadow[left[open_]] = _is_looked_through(caster, there, depth[left[open_]], optics, sweep)
+            shadow[left[open_]] = _is_looked_through(caster, there, optics, sweep)
     return shadow
 
 
-def _is_looked_through(caster: Caster, places_mm: Floats, z_mm: Floats, optics: Optics, sweep: Sweep) -> Bools:
-    """(n,) True for places in the air that the laser reaches, with seen surface no higher than z (n,) behind."""
+def _is_looked_through(caster: Caster, places_mm: Floats, optics: Optics, sweep: Sweep) -> Bools:
+    """(n,) True for places in the air that the laser reaches, with seen surface behind."""
     t = sweep.travel
     station = scan_coordinates(places_mm, optics, sweep)[0]
     base = sweep.origin_mm + station[:, None] * t
@@ -290,7 +289,7 @@ def _is_looked_through(caster: Caster, places_mm: Floats, z_mm: Floats, optics: 
     own = _in_sensor(foot, station[past], sweep)
     seen = -np.einsum("ij,ij->i", normals, ray[past]) >= _WALL
     seen &= (np.einsum("ij,ij->i", normals, camera[past] - foot) > 0) & _fan_holds(own, optics)
-    seen &= (own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= np.minimum(optics.range_mm[1], z_mm[past] + _HIGHER_MM))
+    seen &= (own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1])
     seen[seen] = caster.is_free((foot + _LIFT_MM * normals)[seen], camera[past][seen])
     looked = np.zeros(len(places_mm), dtype=np.bool_)
     looked[np.flatnonzero(past)[seen]] = True
