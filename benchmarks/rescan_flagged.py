@@ -182,7 +182,8 @@ def _ribbons(
     points, face = trimesh.sample.sample_surface(ribbon, count, seed=5)
     points, normals = np.asarray(points), np.asarray(ribbon.face_normals)[face]
     surface, band = cKDTree(samples.points_mm), band_of(samples, true, radius_mm) | left_out
-    good, looked = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    good, excused = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    sure = good.copy()
     solid = Caster(part)
     for side in (1.0, -1.0):
         distance = solid.distance_mm(points, side * normals)
@@ -190,7 +191,8 @@ def _ribbons(
         foot = points[reached] + side * distance[reached, None] * normals[reached]
         nearest = np.asarray(surface.query(foot)[1])
         good[reached] |= true[nearest]
-        looked[reached] |= ~band[nearest]
-    looked |= ~good  # a ribbon that closes nothing off is wrong wherever it is
+        sure[reached] |= true[nearest] & ~band[nearest]
+        excused[reached] |= band[nearest]
+    looked = sure | ~(good | excused)  # a ribbon that closes nothing off is wrong wherever it is
     per_point = float(ribbon.area) / count
     return closed, per_point * int((good & looked).sum()), per_point * int(looked.sum())
