@@ -18,6 +18,7 @@ from scanner_service.api.problems import Problem, ProblemTable, register_problem
 from scanner_service.api.routes import analyses, exports, health, live, results, scanlines, sessions
 from scanner_service.api.scopes import Scoped, check_every_route_declares_a_scope, public
 from scanner_service.api.service import Service
+from scanner_service.rescan.reference import ReferenceUnusable
 from scanner_service.rescan.requirement import RequirementUnusable
 from scanner_service.sessions.errors import (
     AnalysesBusy,
@@ -59,6 +60,7 @@ SESSION_PROBLEMS: ProblemTable = {
     MapFull: Problem(507, "map-full", "The live map is full"),
     RecordBusy: Problem(503, "record-busy", "The record cannot take more now"),
     RecordError: Problem(500, "record-error", "The record failed"),
+    ReferenceUnusable: Problem(422, "reference-unusable", "No scan could be measured against this mesh"),
     RequirementUnusable: Problem(422, "requirement-unusable", "No scan could be judged by this"),
     ValueUnusable: Problem(422, "invalid-value", "A value cannot be used"),
     ExportUnknown: Problem(404, "export-unknown", "There is no such export"),

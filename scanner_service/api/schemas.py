@@ -9,7 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from drivers.scanline import Float64Array, Scanline
 from scanner_service.analysis.normals.field import NormalOptions
 from scanner_service.analysis.radius import LiveRule
+from scanner_service.rescan.presets import requirement_of
+from scanner_service.rescan.requirement import Interest, Requirement
 from scanner_service.sessions.settings import SessionSettings
+from scanner_service.storage.formats.reference_mesh import ReferenceSpec
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
@@ -67,6 +70,47 @@ class PushSourceIn(_Strict):
     kind: Literal["push"]
 
 
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class InterestIn(_Strict):
+    """A box along the axes of the part frame, millimetres; only surface in it is judged."""
+
+    low_mm: Vector
+    high_mm: Vector
+
+
+class RequirementIn(_Strict):
+    """What the scan must reach: a preset, and what is asked for in its place; what is left out is not asked for."""
+
+    preset: Annotated[str, Field(max_length=50, examples=["standard"])] | None = None
+    density_per_mm2: Positive | None = None
+    line_spacing_mm: Positive | None = None
+    chord_error_mm: Positive | None = None
+    finest_line_spacing_mm: Positive | None = None
+    incidence_deg: Annotated[float, Field(gt=0, lt=90, allow_inf_nan=False)] | None = None
+    noise_mm: Positive | None = None
+    coverage_share: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] | None = None
+    interest: InterestIn | None = None
+
+    def to_requirement(self) -> Requirement:
+        """As the session judges by; raises RequirementUnusable."""
+        values = self.model_dump(exclude={"preset", "incidence_deg", "interest"})
+        return requirement_of(
+            self.preset,
+            incidence_rad=None if self.incidence_deg is None else math.radians(self.incidence_deg),
+            interest=None if self.interest is None else Interest(self.interest.low_mm, self.interest.high_mm),
+            **values,
+        )
+
+
+class ReferenceIn(_Strict):
+    """The nominal part: an STL or OBJ file in the service's replay folder, registered to the part frame."""
+
+    file: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00]+$", examples=["nominal.stl"])]
+    units: Literal["mm", "m", "inch"] = "mm"
+
+
 class SettingsIn(_Strict):
     """Radius, reliability and requirement; everything may be left out."""
 
@@ -77,11 +121,18 @@ class SettingsIn(_Strict):
     max_normal_error_deg: Annotated[float, Field(gt=0, le=90, allow_inf_nan=False)] = 5.0
     density_per_mm2: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     max_points: Annotated[int, Field(ge=1, le=100_000_000)] = 20_000_000
+    requirement: RequirementIn = RequirementIn()
+    reference: ReferenceIn | None = None
 
     def to_settings(self) -> SessionSettings:
-        """As the session keeps it."""
-        values = self.model_dump()
-        return SessionSettings(max_normal_error_rad=math.radians(values.pop("max_normal_error_deg")), **values)
+        """As the session keeps it; raises RequirementUnusable."""
+        values = self.model_dump(exclude={"requirement", "reference"})
+        return SessionSettings(
+            max_normal_error_rad=math.radians(values.pop("max_normal_error_deg")),
+            target=self.requirement.to_requirement(),
+            reference=None if self.reference is None else ReferenceSpec(self.reference.file, self.reference.units),
+            **values,
+        )
 
 
 class SessionIn(_Strict):

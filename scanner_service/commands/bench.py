@@ -81,6 +81,36 @@ def _run(command: list[str]) -> None:
         raise typer.Exit(1)
 
 
+@bench_app.command("rescan")
+def rescan_command(
+    json_file: Annotated[Path | None, typer.Option("--json", help="File for the figures.")] = None,
+    meshes: Annotated[Path | None, typer.Option(help="Folder with fandisk.obj, gears.stl, featuretype.STL.")] = None,
+    part: Annotated[str | None, typer.Option(help="One part only.")] = None,
+    spacing: Annotated[float, typer.Option(min=0.05, help="Distance of the truth's samples, mm.")] = 0.15,
+) -> None:
+    """Compare the area of rescan regions with the truth, by reason: recall and precision; takes some minutes."""
+    root = _checkout("rescan")
+    command = [sys.executable, "-m", "benchmarks.rescan", "--spacing", str(spacing)]
+    for name, value in (("--json", json_file), ("--meshes", meshes)):
+        if value is not None:
+            command += [name, str(value.absolute())]
+    if part is not None:
+        command += ["--part", part]
+    if subprocess.run(command, cwd=root, check=False).returncode != 0:
+        raise typer.Exit(1)
+
+
+def _checkout(name: str) -> Path:
+    """The checkout that the benchmark lies in; ends the command when there is none."""
+    root = project_root()
+    if root is None:
+        fail(
+            "The benchmarks are not part of the installed package: clone the project and run "
+            f"`scanner bench {name}` from there, installed with `pip install --editable '.[bench]'`."
+        )
+    return root
+
+
 def project_root() -> Path | None:
     """The checkout that this package runs from; None when it was installed without one."""
     root = Path(scanner_service.__file__).resolve().parent.parent

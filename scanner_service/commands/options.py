@@ -7,6 +7,7 @@ from typing import Annotated, cast, get_args
 
 import typer
 
+from scanner_service.rescan.requirement import Interest
 from scanner_service.storage.formats.recording import Units
 from scanner_service.storage.reader import RecordReader
 
@@ -47,3 +48,14 @@ def parse_position(text: str | None) -> tuple[float, float, float] | None:
     except ValueError:
         raise ValueError(f"a position is three numbers x,y,z in mm, not {text}") from None
     return (x, y, z)
+
+
+def parse_interest(text: str | None) -> Interest | None:
+    """A region of interest: low and high corner as `x,y,z,x,y,z` in mm; None stays None."""
+    if text is None:
+        return None
+    try:
+        x, y, z, right, far, top = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError(f"a region of interest is six numbers x,y,z,x,y,z in mm, not {text}") from None
+    return Interest((x, y, z), (right, far, top))

@@ -160,6 +160,7 @@ def regions_table(regions: list[dict[str, Any]], title: str) -> Table:
         table.add_column(name, justify=justify)  # type: ignore[arg-type]
     for name in ("required /mm²", "priority"):
         table.add_column(name, justify="right")
+    table.add_column("status")
     table.add_column("remedy")
     for region in regions:
         table.add_row(
@@ -169,6 +170,7 @@ def regions_table(regions: list[dict[str, Any]], title: str) -> Table:
             _number(region["measured_per_mm2"]),
             _number(region["required_per_mm2"]),
             f"{region['priority']:.2f}",
+            str(region["status"]),
             str(region["remedy"]),
         )
     return table

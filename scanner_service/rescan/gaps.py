@@ -8,7 +8,7 @@ of the fan in the scanlines of a pass. Between the two ends A and B of such a pa
   other end. A camera's shadow runs along the camera's ray, at the triangulation angle (20-40°) to the laser's; the
   laser's shadow runs along the laser's ray;
 - a *flank*: the same, but three pairs or more in a row jump in the same sense, or neither end has a plane, or the plane
-  of one leads to the other: steep surface;
+  of one leads to the other (of both, where that is more than six radii away): steep surface;
 - *filled*: a shadow of one pass, about whose middle another pass has points;
 - *out of range*: both ends stand near an end of the measurement range;
 - a *hole*: anything else. An inner border of the part, or dropouts: not a reason by itself. So is a jump over places
@@ -31,6 +31,7 @@ from scanner_service.rescan.strips import Strips, in_a_row
 Pairs = tuple[IntArray, IntArray, Float64Array, IntArray]  # first and second rows, width_mm, lane
 
 _LEAST_SPACINGS = 3.0
+_FAR_BELOW = 6.0  # radii: ends further apart are on one flank only if the planes of both say so
 _LOST = 3  # places without a return that are more than chance
 _FACING = 0.5  # cosine of the largest incidence at the foot of a shadow
 _RANGE_SHARE = 0.005  # share of the range within which a point is near its end, whatever the surface does
@@ -203,14 +204,14 @@ def _classified(
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     drop = np.einsum("ij,ij->i", vector, ray)
     reach = np.maximum(strips.reach_mm[first], strips.reach_mm[second])
-    off_tangent = np.fmin(
-        np.abs(np.einsum("ij,ij->i", vector, snapshot.normals[first])),
-        np.abs(np.einsum("ij,ij->i", vector, snapshot.normals[second])),
-    )
+    off_first = np.abs(np.einsum("ij,ij->i", vector, snapshot.normals[first]))
+    off_second = np.abs(np.einsum("ij,ij->i", vector, snapshot.normals[second]))
+    off_tangent = np.fmin(off_first, off_second)
+    on_tangent_mm = np.maximum(0.5 * reach, 0.2 * length)
     place = stations.rank[line] if across else snapshot.index
     lost = np.abs(place[second] - place[first]).astype(np.int64) - 1
     # the sight that grazes a silhouette lies in its tangent plane, but what it hides is lost
-    leaves_surface = ~(off_tangent <= np.maximum(0.5 * reach, 0.2 * length)) | (lost > _LOST)
+    leaves_surface = ~(off_tangent <= on_tangent_mm) | (lost > _LOST)
     sideways = np.sqrt(np.maximum(length**2 - drop**2, 0.0))
     steep = (np.abs(drop) > reach) & (np.abs(drop) > sideways)
     jump = steep & leaves_surface
@@ -235,8 +236,14 @@ def _classified(
     kind = np.full(len(first), GapKind.HOLE, dtype=np.uint8)
     near = near_range_end(snapshot, stations, strips, fan, geometry)
     kind[near[first] & near[second]] = GapKind.OUT_OF_RANGE
-    kind[jump] = GapKind.SHADOW
-    kind[(jump & goes_on) | (steep & ~leaves_surface)] = GapKind.FLANK
+    # round a silhouette only the upper plane leads down, to something far below
+    silhouette = (
+        steep & ~leaves_surface & (length > _FAR_BELOW * reach) & (np.fmax(off_first, off_second) > on_tangent_mm)
+    )
+    if geometry is None:
+        silhouette[:] = False
+    kind[jump | silhouette] = GapKind.SHADOW
+    kind[(jump & goes_on) | (steep & ~leaves_surface & ~silhouette)] = GapKind.FLANK
     settled = snapshot.settled[first] & snapshot.settled[second]
     rows = np.flatnonzero((steep | apart) & settled)
     kind[rows] = np.where(

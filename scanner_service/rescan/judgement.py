@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
 from scanner_service.analysis.snapshot import MapSnapshot, UInt8Array
 from scanner_service.rescan.border import LEAST_OFFSET, border_aware
+from scanner_service.rescan.curvature import curvature_across_per_mm
 from scanner_service.rescan.gaps import Fan, GapKind, Gaps, near_range_end
 from scanner_service.rescan.noise import noise_along_lines
 from scanner_service.rescan.requirement import Requirement
@@ -38,6 +39,7 @@ class Reason(IntEnum):
     LOST_LINES = 5
     NOISY = 6
     ISOLATED = 7
+    UNTOUCHED = 8  # said of regions of a reference surface only, never of a point
 
     @property
     def label(self) -> str:
@@ -54,6 +56,7 @@ REMEDIES = {
     Reason.LOST_LINES: "the same pass again",
     Reason.NOISY: "slower, other exposure or other direction",
     Reason.ISOLATED: "none: flagged",
+    Reason.UNTOUCHED: "a pass that sees it",
 }
 
 
@@ -66,7 +69,7 @@ class Judgement:
     density that the spacing on the surface gives, 1 / (Δs'·δp) with the widest strip (NaN: unknown). `width_mm` (n, 2)
     are the strips' widths on the point's own surface (NaN: the surface ends or is unknown there), `failing_strip`
     (n, 2) the strips that fail. `grazing` is True where the ray is known to graze the surface. `noise_mm` is the noise
-    along the line (NaN: unknown or not asked for).
+    along the line (NaN: unknown or not asked for). `allowed_mm` is the largest strip width that the requirement allows.
     """
 
     judged: BoolArray
@@ -78,6 +81,7 @@ class Judgement:
     failing_strip: BoolArray
     grazing: BoolArray
     noise_mm: Float64Array
+    allowed_mm: Float64Array
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -110,8 +114,12 @@ def judge(
     """
     line, n = snapshot.line, len(snapshot)
     required = requirement.per_mm2(strips.line_spacing_mm, strips.nominal_point_spacing_mm)
+    if requirement.density_per_mm2 is None:
+        required = _no_more_than_the_first_pass(required, strips)
     counted_density = border_aware(snapshot.side_density_per_mm2, snapshot.offset)
     judged = snapshot.settled & (snapshot.neighbours > 0) & np.isfinite(required)
+    if requirement.interest is not None:
+        judged &= requirement.interest.holds(snapshot.points_mm)
 
     wall = np.zeros(n, dtype=bool)
     flank = np.zeros(n, dtype=bool)
@@ -126,12 +134,15 @@ def judge(
     delta = strips.line_spacing_mm[:, None]
     lost = (missing > 0) & ~(gap <= _LOST_GAP * delta)
     fast = ~lost & (gap > _SPARSE_GAP * delta)
+    by_rule = _allowed_by_rule(snapshot, requirement, strips, noise_mm, judged)
     too_wide = width > _SLACK * allowed[:, None]
+    beyond_rule = width > _SLACK * by_rule[:, None]
     # beyond this a neighbourhood no longer reaches the next line: Δs'/Δs > sqrt(2) + c/Δs
     beyond = (width * delta > strips.reach_mm[:, None] * stride) & (stride > 0) & ~(lost | fast)
     one_sided = ~(snapshot.offset < LEAST_OFFSET)
     enough = (snapshot.side_density_per_mm2 >= required) & ~one_sided
-    failing = ((too_wide & ~enough[:, None]) | beyond) & judged[:, None]
+    failing = ((too_wide & ~enough[:, None]) | beyond | beyond_rule) & judged[:, None]
+    allowed = np.fmin(allowed, by_rule)
     filled = _filled(snapshot, strips, failing, np.fmin(allowed, strips.reach_mm))
     failing &= ~filled
     width = np.where(filled, np.fmin(width, delta), width)  # what lies further out is the other pass's surface
@@ -156,10 +167,15 @@ def judge(
     for mask, why in ((fast, Reason.SPARSE), (lost, Reason.LOST_LINES)):
         reason[(failing & mask).any(axis=1)] = why
 
+    if requirement.incidence_rad is not None:
+        turned = judged & (reason == Reason.NONE) & (incidence < np.cos(requirement.incidence_rad))
+        reason[turned & ~_seen_better(snapshot, strips, turned, incidence >= np.cos(requirement.incidence_rad))] = (
+            Reason.STEEP
+        )
     noise = np.full(n, np.nan)
-    if noise_mm is not None:
+    limit = requirement.noise_limit_mm(noise_mm)
+    if limit is not None:
         noise = noise_along_lines(snapshot, strips.order)
-        limit = requirement.noise_factor * noise_mm
         noisy = judged & (reason == Reason.NONE) & (noise > limit) & (snapshot.residual_mm > limit)
         reason[noisy] = Reason.NOISY
     if geometry is not None:
@@ -175,7 +191,44 @@ def judge(
     below = gaps.low[rows]
     reason[below[(reason[below] == Reason.SPARSE) & ~failing[below].any(axis=1)]] = Reason.SHADOW
     reason[~judged] = Reason.NONE
-    return Judgement(judged, reason, required, counted_density, worst, width, failing, grazing, noise)
+    return Judgement(judged, reason, required, counted_density, worst, width, failing, grazing, noise, allowed)
+
+
+def _no_more_than_the_first_pass(required_per_mm2: Float64Array, strips: Strips) -> Float64Array:
+    """(n,) What is asked of later passes is bounded by what the first was asked: a finer pass must be able to mend."""
+    if not len(required_per_mm2):
+        return required_per_mm2
+    first = required_per_mm2[strips.group == strips.group[0]]
+    known = first[np.isfinite(first)]
+    return (
+        np.minimum(required_per_mm2, float(np.median(known)))
+        if len(known) and (first.size < strips.group.size)
+        else (required_per_mm2)
+    )
+
+
+def _allowed_by_rule(
+    snapshot: MapSnapshot, requirement: Requirement, strips: Strips, noise_mm: float | None, judged: BoolArray
+) -> Float64Array:
+    """(n,) largest line spacing that line spacing and chord error allow, whatever the density; inf: any."""
+    curvature = np.full(len(snapshot), np.nan)
+    if requirement.chord_error_mm is not None:
+        rows = np.flatnonzero(judged).astype(np.int64)
+        curvature[rows] = curvature_across_per_mm(snapshot, rows, strips.reach_mm, noise_mm)
+    return requirement.allowed_spacing_mm(curvature)
+
+
+def _seen_better(snapshot: MapSnapshot, strips: Strips, rows: BoolArray, good: BoolArray) -> BoolArray:
+    """(n,) True for the rows within whose radius another pass has a point that meets the incidence."""
+    seen = np.zeros(len(snapshot), dtype=bool)
+    good = good & (snapshot.neighbours > 0)
+    for number in np.unique(strips.group[rows]):
+        others = good & (strips.group != number)
+        mine = np.flatnonzero(rows & (strips.group == number))
+        if others.any():
+            away = cKDTree(snapshot.points_mm[others]).query(snapshot.points_mm[mine])[0]
+            seen[mine] = away <= strips.reach_mm[mine]
+    return seen
 
 
 def _width_on_surface(snapshot: MapSnapshot, stations: Stations, strips: Strips, wall: BoolArray) -> Float64Array:

@@ -5,12 +5,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from drivers.scanline import Float64Array
+from drivers.scanline import BoolArray, Float64Array
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.gaps import Fan, GapKind, Gaps
 from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason
 from scanner_service.rescan.outline import patch_of
-from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of
+from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of, succession
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.stations import IntArray, Stations
 from scanner_service.rescan.strips import Strips
@@ -62,8 +62,7 @@ def patches(
     by_label = np.argsort(label, kind="stable")
     groups = np.split(rows[by_label], np.flatnonzero(np.diff(label[by_label])) + 1)
     np.maximum.at(connection, links[:, 0], span)
-    if steep:
-        np.maximum.at(connection, links[:, 1], span)
+    np.maximum.at(connection, links[:, 1], span)
     large = [
         _region(snapshot, requirement, strips, judgement, unfolded_mm, reason, group, connection[group], noise_mm)
         for group in groups
@@ -123,6 +122,21 @@ def _near_edges(points_mm: Float64Array, connection_mm: Float64Array) -> IntArra
     return np.column_stack([first[near], second[near]]).astype(np.int64)
 
 
+def _halfway(strips: Strips, rows: IntArray, by_gap: BoolArray) -> tuple[IntArray, IntArray]:
+    """Pairs of a point of the patch (rows, rising) and a neighbour on its surface that is not of it.
+
+    A point stands for the surface halfway to its neighbours: in its own line, and in the lines beside, but not where
+    it fails `by_gap` (k,) only: then it stands at the border of what is missing.
+    """
+    on_surface = np.isfinite(strips.width_mm[rows]) & ~by_gap[:, None]
+    beside = np.where(on_surface, strips.link[rows], -1)
+    other = np.concatenate([strips.chain[rows], beside], axis=1).T.reshape(-1)
+    owner = np.tile(rows, 4)
+    mine = np.minimum(np.searchsorted(rows, other), len(rows) - 1)
+    outside = (other >= 0) & (rows[mine] != other)
+    return owner[outside], other[outside]
+
+
 def _region(
     snapshot: MapSnapshot,
     requirement: Requirement,
@@ -135,9 +149,16 @@ def _region(
     noise_mm: float | None,
 ) -> RescanRegion:
     """One patch of failing points."""
-    spacing = np.fmin(strips.nominal_point_spacing_mm[rows], connection_mm)
     one_pass = bool((strips.group[rows] == strips.group[rows[0]]).all())
-    patch = patch_of(snapshot.points_mm[rows], connection_mm, spacing, unfolded_mm[rows] if one_pass else None)
+    by_gap: BoolArray = np.asarray(judgement.failing_strip[rows].any(axis=1) & (reason is not Reason.STEEP))
+    owner, other = _halfway(strips, rows, by_gap)
+    if reason is Reason.OUT_OF_RANGE:  # what is missing lies beyond the points, not around them
+        owner, other = rows[:0], rows[:0]
+    points = np.concatenate([snapshot.points_mm[rows], 0.5 * (snapshot.points_mm[owner] + snapshot.points_mm[other])])
+    unfolded = np.concatenate([unfolded_mm[rows], 0.5 * (unfolded_mm[owner] + unfolded_mm[other])])
+    connection = np.concatenate([connection_mm, connection_mm[np.searchsorted(rows, owner)]])
+    spacing = np.fmin(strips.nominal_point_spacing_mm[np.concatenate([rows, owner])], connection)
+    patch = patch_of(points, connection, spacing, unfolded if one_pass else None)
     normal = mean_normal(snapshot.normals[rows])
     if np.isnan(normal).any():
         towards = snapshot.lines.laser_mm[snapshot.line[rows]].mean(axis=0) - patch.centroid_mm
@@ -148,14 +169,19 @@ def _region(
     required = float(np.median(judgement.required_per_mm2[rows]))
     middle = float(np.median(values))
     deficit = 1.0 - middle / required
-    if reason is Reason.NOISY and noise_mm is not None:
-        deficit = 1.0 - requirement.noise_factor * noise_mm / float(np.median(judgement.noise_mm[rows]))
+    limit = requirement.noise_limit_mm(noise_mm)
+    allowed = float(np.median(judgement.allowed_mm[rows]))
+    too_wide = judgement.failing_strip[rows] & (judgement.width_mm[rows] > allowed)
+    if reason is Reason.NOISY and limit is not None:
+        deficit = 1.0 - limit / float(np.median(judgement.noise_mm[rows]))
     elif reason is Reason.STEEP:
         deficit = max(deficit, 1.0 - float(np.median(strips.reach_mm[rows] / connection_mm)))
     elif reason is Reason.OUT_OF_RANGE:
         deficit = 1.0
     elif reason is Reason.ISOLATED:
         deficit = 0.0
+    elif too_wide.any():  # chord error and line spacing ask for more than the density does
+        deficit = max(deficit, 1.0 - allowed / float(np.median(judgement.width_mm[rows][too_wide])))
     return RescanRegion(
         number=0,
         reason=reason,
@@ -170,4 +196,14 @@ def _region(
         point_count=len(rows),
         remedy=REMEDIES[reason],
         point_rows=rows,
+        confidence=succession(int(_fails_alone(judgement, rows, values, required).sum()), len(rows)),
+        line_spacing_mm=allowed,
     )
+
+
+def _fails_alone(judgement: Judgement, rows: IntArray, values: Float64Array, required: float) -> BoolArray:
+    """(k,) True for the points whose own measurement says that they fail, whatever their neighbours are."""
+    measured_otherwise = np.isin(judgement.reason[rows], (Reason.NOISY, Reason.OUT_OF_RANGE, Reason.ISOLATED))
+    alone: BoolArray = judgement.failing_strip[rows].any(axis=1) | (values < required) | judgement.grazing[rows]
+    alone |= measured_otherwise
+    return alone

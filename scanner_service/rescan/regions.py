@@ -9,7 +9,7 @@ from scanner_service.analysis.snapshot import MapSnapshot, UInt8Array
 from scanner_service.rescan.gaps import GapKind, Gaps, fan_of, find_gaps, gap_lengths_mm
 from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason, judge
 from scanner_service.rescan.patches import UPRIGHT, as_scanned, patches
-from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of
+from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of, succession
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.ribbons import Ribbon, shadow_ribbons
 from scanner_service.rescan.rungs import settled_kinds
@@ -37,9 +37,10 @@ class RegionReport:
 
     `rescan` marks the points of regions; `reason` is the point's own verdict, which may be other than NONE outside of
     any region (a patch smaller than the requirement asks). `counts` are points by verdict: `ok`, each reason,
-    `unsettled`, `not_counted`, `requirement_unknown`; they add up to n. `small_patches` are, by reason, the patches
-    that are too small to be regions; the area of those with fewer points than a region is taken from the nominal
-    spacings. `judgement`, `strips` and `gaps` are what the report was made from.
+    `unsettled`, `not_counted`, `requirement_unknown`, and `outside_interest` where there is a region of interest; they
+    add up to n. `small_patches` are, by reason, the patches that are too small to be regions; the area of those with
+    fewer points than a region is taken from the nominal spacings. `judgement`, `strips` and `gaps` are what the report
+    was made from.
     """
 
     version: int
@@ -97,6 +98,8 @@ def find_regions(
     strips = strips_of(snapshot, stations, requirement)
     fan = fan_of(snapshot, stations, strips, towards_sensor)
     gaps = settled_kinds(snapshot, strips, find_gaps(snapshot, stations, strips, fan, geometry))
+    if requirement.interest is not None:
+        gaps = _within(requirement.interest.holds(snapshot.points_mm), gaps)
     judgement = judge(snapshot, requirement, stations, strips, fan, gaps, geometry, noise_mm)
     ribbons = shadow_ribbons(snapshot, requirement, strips, gaps)
     ribbons, gaps, judgement = _flanks_completed(snapshot, ribbons, strips, gaps, judgement)
@@ -126,7 +129,7 @@ def find_regions(
         regions=regions,
         rescan=rescan,
         reason=judgement.reason,
-        counts=_counts(snapshot, judgement),
+        counts=_counts(snapshot, judgement, requirement),
         small_patches=_by_reason(small),
         judgement=judgement,
         strips=strips,
@@ -134,7 +137,13 @@ def find_regions(
     )
 
 
-def _counts(snapshot: MapSnapshot, judgement: Judgement) -> dict[str, int]:
+def _within(inside: BoolArray, gaps: Gaps) -> Gaps:
+    """The gaps with those that have no end inside of the region of interest of no consequence."""
+    beyond = ~(inside[gaps.high] | inside[gaps.low])
+    return replace(gaps, kind=np.where(beyond, np.uint8(GapKind.HOLE), gaps.kind))
+
+
+def _counts(snapshot: MapSnapshot, judgement: Judgement, requirement: Requirement) -> dict[str, int]:
     """Points by verdict; they add up to the points of the snapshot."""
     judged, counted = judgement.judged, snapshot.neighbours > 0
     counts = {"ok": int((judged & (judgement.reason == Reason.NONE)).sum())}
@@ -143,7 +152,12 @@ def _counts(snapshot: MapSnapshot, judgement: Judgement) -> dict[str, int]:
             counts[reason.label] = int((judgement.reason == reason).sum())
     counts["unsettled"] = int((counted & ~snapshot.settled).sum())
     counts["not_counted"] = int((~counted).sum())
-    counts["requirement_unknown"] = int((counted & snapshot.settled & ~judged).sum())
+    left = counted & snapshot.settled & ~judged
+    if requirement.interest is not None:
+        outside = left & ~requirement.interest.holds(snapshot.points_mm)
+        counts["outside_interest"] = int(outside.sum())
+        left &= ~outside
+    counts["requirement_unknown"] = int(left.sum())
     return counts
 
 
@@ -225,6 +239,8 @@ def _shadow_regions(ribbons: list[Ribbon], gaps: Gaps, judgement: Judgement) -> 
                 point_count=len(rows),
                 remedy=REMEDIES[Reason.SHADOW],
                 point_rows=rows,
+                confidence=succession(len(ribbon.gaps), len(ribbon.gaps)),
+                line_spacing_mm=float(np.median(judgement.allowed_mm[rows])),
             )
         )
     return regions

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from drivers.scanline import BoolArray, Float64Array
 from scanner_service.analysis.snapshot import MapSnapshot
-from scanner_service.rescan.gaps import GapKind, Gaps
+from scanner_service.rescan.gaps import GapKind, Gaps, gap_lengths_mm
 from scanner_service.rescan.stations import IntArray
 from scanner_service.rescan.strips import Strips, in_a_row
 
@@ -178,8 +178,9 @@ def settled_kinds(snapshot: MapSnapshot, strips: Strips, gaps: Gaps) -> Gaps:
     """
     rows = np.flatnonzero((gaps.kind == GapKind.SHADOW) | (gaps.kind == GapKind.FLANK)).astype(np.int64)
     rungs = rungs_of(snapshot, strips, gaps, rows)
-    flank = np.zeros(len(rungs), dtype=bool)
-    flank[rungs.of_gap[gaps.kind[rows] == GapKind.FLANK]] = True
+    length = gap_lengths_mm(snapshot, gaps, rows)
+    of_flank = np.bincount(rungs.of_gap, weights=length * (gaps.kind[rows] == GapKind.FLANK), minlength=len(rungs))
+    flank = 4.0 * of_flank >= np.bincount(rungs.of_gap, weights=length, minlength=len(rungs))
     chains = chains_of(rungs)
     for chain in chains:
         flank[chain] = 2 * flank[chain].sum() > len(chain)

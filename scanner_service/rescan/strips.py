@@ -24,6 +24,7 @@ _END_SLACK = 0.6  # a chain is taken to reach this many point spacings beyond it
 class Strips:
     """The strip before (column 0) and after (column 1) each point; arrays of n rows like the snapshot.
 
+    `chain` (n, 2) are the points before and after it in its own line, as long as the line is unbroken there (-1: not).
     `link` (n, 2) is the nearest point of the adjacent scanline (-1: none beside the point), `width_mm` (n, 2) the
     distance to that scanline on the surface (NaN: none). `point_spacing_mm` (n,) is the mean distance of the
     consecutive points around the point in its own line (NaN: it stands alone), `line_spacing_mm` (n,) the nominal Δs,
@@ -32,6 +33,7 @@ class Strips:
     `along` (p, 3) is each pass's direction of the line, `order` (n,) the points by line and place in the line.
     """
 
+    chain: IntArray
     link: IntArray
     width_mm: Float64Array
     point_spacing_mm: Float64Array
@@ -74,10 +76,12 @@ def strips_of(snapshot: MapSnapshot, stations: Stations, requirement: Requiremen
         _nearest_in_line(points, u_sorted, start, target, bound, spacing, found, distance)
         link[rows, side] = np.where(found >= 0, rows[found], -1)
         width[rows, side] = distance
+    chain, point_spacing = _along_the_line(snapshot, order, spacing, reach)
     return Strips(
+        chain=chain,
         link=link,
         width_mm=width,
-        point_spacing_mm=_spacing_along(snapshot, order, spacing, reach),
+        point_spacing_mm=point_spacing,
         line_spacing_mm=lines.line_spacing_mm[line],
         nominal_point_spacing_mm=spacing[line],
         reach_mm=reach,
@@ -131,15 +135,20 @@ def _directions(snapshot: MapSnapshot, stations: Stations, order: IntArray) -> F
     return along
 
 
-def _spacing_along(snapshot: MapSnapshot, order: IntArray, spacing: Float64Array, reach: Float64Array) -> Float64Array:
-    """(n,) mean length of the up to four unbroken segments around each point, two on either side."""
+def _along_the_line(
+    snapshot: MapSnapshot, order: IntArray, spacing: Float64Array, reach: Float64Array
+) -> tuple[IntArray, Float64Array]:
+    """(n, 2) neighbours over unbroken segments; (n,) mean length of up to four of them, two on either side."""
+    chain = np.full((len(order), 2), -1, dtype=np.int64)
     result = np.full(len(order), np.nan)
     if len(order) < 2:
-        return result
+        return chain, result
     points, line = snapshot.points_mm[order], snapshot.line[order]
     length = np.linalg.norm(np.diff(points, axis=0), axis=1)
     broken_beyond = np.fmax(_CHAIN_BREAK * spacing[line[1:]], reach[order[1:]])
     whole = (np.diff(line) == 0) & (length <= broken_beyond)
+    chain[order[1:][whole], 0] = order[:-1][whole]
+    chain[order[:-1][whole], 1] = order[1:][whole]
     total, segments = np.zeros(len(order)), np.zeros(len(order))
     right1 = np.append(whole, False)
     right2 = right1 & np.append(right1[1:], False)
@@ -151,7 +160,7 @@ def _spacing_along(snapshot: MapSnapshot, order: IntArray, spacing: Float64Array
         segments += has
     with np.errstate(invalid="ignore", divide="ignore"):
         result[order] = np.where(segments > 0, total / segments, np.nan)
-    return result
+    return chain, result
 
 
 @njit(cache=True, nogil=True)

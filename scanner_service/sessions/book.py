@@ -6,9 +6,12 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from pathlib import Path
 
+from scanner_service.rescan.reference import ReferenceSurface, ReferenceUnusable
 from scanner_service.sessions.calibration import calibration_of, geometry_from, towards_sensor_from
-from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SessionError
+from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SessionError, SourceUnusable
+from scanner_service.sessions.references import open_reference
 from scanner_service.sessions.retention import OVER, Kept, Retention, choose
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
@@ -16,6 +19,7 @@ from scanner_service.sessions.source_specs import PushSpec, SourceSpec
 from scanner_service.sessions.sources import PushSource, Source, SpentSource
 from scanner_service.sessions.withdrawals import SERVICE_ENDED
 from scanner_service.storage.errors import RecordError
+from scanner_service.storage.formats.errors import FormatError
 from scanner_service.storage.record import Record, utc_now
 from scanner_service.storage.rows import CreationKey, SessionRow
 
@@ -43,10 +47,12 @@ class SessionBook:
     def __init__(
         self,
         record: Record,
+        meshes: Path | None = None,
         retention: Retention | None = None,
         clock: Callable[[], datetime] = utc_now,
     ) -> None:
         self.record = record
+        self._meshes = meshes  # the folder in which reference meshes lie
         self.retention = retention or Retention()
         self._clock = clock
         self._live: dict[str, LiveSession] = {}
@@ -70,10 +76,12 @@ class SessionBook:
         origin_mm: Sequence[float] = (0.0, 0.0, 0.0),
         source: Source | None = None,
         key: CreationKey | None = None,
+        reference: ReferenceSurface | None = None,
     ) -> LiveSession:
         """Make a session and hold it open; `source` is the opened source when the caller has it already.
 
-        With a `key` that came before, the session that was made then; nothing is opened or made.
+        `reference` is the nominal part that the settings name. With a `key` that came before, the session that was
+        made then; nothing is opened or made.
 
         Raises
         ------
@@ -84,7 +92,7 @@ class SessionBook:
         RecordError : the session could not be recorded.
         """
         if key is None:
-            return self._create(name, spec, settings, origin_mm, source, None)
+            return self._create(name, spec, settings, origin_mm, source, None, reference)
         with self._lock:
             if key.key_sha256 in self._creating:
                 raise SessionBusy("the same request is being carried out; ask again in a moment")
@@ -93,7 +101,7 @@ class SessionBook:
             made = self.record.made_with(key)
             if made is not None:
                 return self.get(made.session_id)
-            return self._create(name, spec, settings, origin_mm, source, key)
+            return self._create(name, spec, settings, origin_mm, source, key, reference)
         finally:
             with self._lock:
                 self._creating.discard(key.key_sha256)
@@ -106,6 +114,7 @@ class SessionBook:
         origin_mm: Sequence[float],
         source: Source | None,
         key: CreationKey | None,
+        reference: ReferenceSurface | None,
     ) -> LiveSession:
         self.make_room_on_disk()
         with self._lock:
@@ -121,7 +130,7 @@ class SessionBook:
                     calibration=calibration_of(opened),
                     key=key,
                 )
-                session = LiveSession(row, self.record, opened)
+                session = LiveSession(row, self.record, opened, reference=reference)
                 session.open()
                 self._live[row.session_id] = session
                 return session
@@ -169,7 +178,7 @@ class SessionBook:
         is_push = row.source.get("kind") == PushSpec().to_dict()["kind"]
         kept = row.calibration
         source: Source = PushSource() if is_push else SpentSource(geometry_from(kept), towards_sensor_from(kept))
-        session = LiveSession(row, self.record, source)
+        session = LiveSession(row, self.record, source, reference=self._reference_of(row))
         session.open(taken)
         with self._lock:
             self._live[row.session_id] = session
@@ -256,6 +265,17 @@ class SessionBook:
             for live in self._live.values():
                 stack.callback(live.close)
             self._live = {}
+
+    def _reference_of(self, row: SessionRow) -> ReferenceSurface | None:
+        """The nominal part of a session that is opened again; None when there is none, or not the same any more."""
+        spec = SessionSettings.from_dict(row.settings).reference
+        if spec is None or self._meshes is None:
+            return None
+        try:
+            return open_reference(spec, self._meshes)[0]
+        except (FormatError, ReferenceUnusable, SourceUnusable) as error:
+            _LOG.warning("session %s is opened without its reference mesh: %s", row.session_id, error)
+            return None
 
     def _make_room(self) -> None:
         """Close the session that was opened first among those that do not scan."""

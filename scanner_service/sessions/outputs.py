@@ -52,16 +52,16 @@ def _points(path: Path, outcome: Outcome) -> None:
 def _density(path: Path, outcome: Outcome) -> None:
     picture = density_png(
         outcome.results.snapshot,
-        outcome.results.report.regions,
+        outcome.results.regions,
         session_name=outcome.row.name,
         when=outcome.row.created_utc[:16].replace("T", " ") + " UTC",
-        coverage=outcome.results.coverage.share,
+        coverage=outcome.results.share,
     )
     write_whole(path, picture)
 
 
 def _regions(path: Path, outcome: Outcome) -> None:
-    write_json(path, {"session": outcome.row.session_id, **outcome.results.report.to_dict()})
+    write_json(path, {"session": outcome.row.session_id, **outcome.results.regions_dict()})
 
 
 def _summary(path: Path, outcome: Outcome) -> None:

@@ -1,8 +1,8 @@
 """What a session has found out at one moment: map, verdict, coverage; knows no thread and no device."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,14 @@ import numpy as np
 from drivers.scanline import BoolArray, Float64Array, SensorGeometry
 from scanner_service.analysis.snapshot import MapSnapshot, RadiusRule, UInt8Array, Unreliable
 from scanner_service.rescan.coverage import Coverage, observed_coverage
+from scanner_service.rescan.reference import (
+    ReferenceCoverage,
+    ReferenceSurface,
+    ReferenceUnusable,
+    check_place,
+    reference_coverage,
+)
+from scanner_service.rescan.region import RescanRegion
 from scanner_service.rescan.regions import RegionReport, find_regions
 from scanner_service.rescan.requirement import Requirement
 
@@ -24,16 +32,60 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """A snapshot, judged."""
+    """A snapshot, judged.
+
+    `regions` are those of the report, followed through the session: with ids, status and history, numbered by falling
+    priority; `resolved` those that were mended. `reference` is the coverage of the nominal part, None without one, or
+    as long as there are too few points, or when `reference_refused` says why it cannot be told.
+    """
 
     snapshot: MapSnapshot
     report: RegionReport
     coverage: Coverage
+    requirement: Requirement
+    regions: tuple[RescanRegion, ...]
+    resolved: tuple[RescanRegion, ...] = ()
+    reference: ReferenceCoverage | None = None
+    reference_refused: str | None = None
 
     @property
     def verdict(self) -> Verdict:
         """The verdict on every point."""
         return Verdict(self.report.rescan, self.report.reason)
+
+    @property
+    def share(self) -> float:
+        """Coverage: of the nominal part where there is one, else of the surface seen; NaN when unknown."""
+        return self.coverage.share if self.reference is None else self.reference.share
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether the coverage asked for is reached; None when none is asked for, or none is known."""
+        asked = self.requirement.coverage_share
+        return None if asked is None or math.isnan(self.share) else self.share >= asked
+
+    def regions_dict(self) -> dict[str, Any]:
+        """For JSON: the report, with the regions as they are followed."""
+        return self.report.to_dict() | {
+            "requirement": self.requirement.to_dict(),
+            "regions": [region.to_dict() for region in self.regions],
+            "resolved": [region.to_dict() for region in self.resolved],
+        }
+
+    def coverage_dict(self) -> dict[str, Any]:
+        """For JSON: what is asked for, what is reached, and of the nominal part what was never touched."""
+        observed = self.coverage
+        return {
+            "kind": "observed" if self.reference is None else "reference",
+            "share": self.share,
+            "required": self.requirement.coverage_share,
+            "holds": self.holds,
+            "observed_share": observed.share,
+            "cell_mm": observed.cell_mm,
+            "gap_mm2": observed.gap_mm2,
+            "reference": None if self.reference is None else self.reference.to_dict(),
+            "reference_refused": self.reference_refused,
+        }
 
 
 def judge(
@@ -41,10 +93,27 @@ def judge(
     requirement: Requirement,
     geometry: SensorGeometry | None = None,
     towards_sensor: Float64Array | None = None,
+    reference: ReferenceSurface | None = None,
 ) -> Results:
-    """Find the rescan regions and the coverage of a snapshot; the last two as `find_regions` has them."""
+    """Find the rescan regions and the coverage of a snapshot; geometry and direction as `find_regions` has them."""
     report = find_regions(snapshot, requirement, geometry, towards_sensor=towards_sensor)
-    return Results(snapshot, report, observed_coverage(snapshot, report))
+    measured, refused = None, None
+    if reference is not None:
+        try:
+            if check_place(reference, snapshot):
+                measured = reference_coverage(reference, snapshot, report, requirement)
+        except ReferenceUnusable as error:
+            refused = str(error)
+    regions = report.regions + (measured.untouched if measured is not None else ())
+    return Results(
+        snapshot=snapshot,
+        report=report,
+        coverage=observed_coverage(snapshot, report),
+        requirement=requirement,
+        regions=tuple(replace(region, number=number) for number, region in enumerate(regions, start=1)),
+        reference=measured,
+        reference_refused=refused,
+    )
 
 
 def summarise(
@@ -55,21 +124,18 @@ def summarise(
     notes: tuple[str, ...] = (),
 ) -> dict[str, Any]:
     """The content of summary.json: lengths in millimetres, densities in points/mm2, NaN for what is not known."""
-    snapshot, report, coverage = results.snapshot, results.report, results.coverage
+    snapshot = results.snapshot
     return _of_points(snapshot, losses, version, notes) | {
         "scanlines": len(snapshot.lines),
         "line_spacing_mm": _spread(snapshot.lines.line_spacing_mm),
         "point_spacing_mm": _spread(snapshot.lines.point_spacing_mm),
-        "coverage": {
-            "kind": "observed",
-            "share": coverage.share,
-            "cell_mm": coverage.cell_mm,
-            "gap_mm2": coverage.gap_mm2,
-        },
+        "coverage": results.coverage_dict(),
+        "requirement": results.requirement.to_dict(),
         "regions": {
-            "count": len(report.regions),
-            "area_mm2": float(sum(region.area_mm2 for region in report.regions)),
-            "by_reason": _areas(report),
+            "count": len(results.regions),
+            "area_mm2": float(sum(region.area_mm2 for region in results.regions)),
+            "by_reason": _areas(results.regions),
+            "resolved": len(results.resolved),
         },
         "points_per_s": points_per_s,
     }
@@ -112,9 +178,9 @@ def _of_points(
     }
 
 
-def _areas(report: RegionReport) -> dict[str, dict[str, float]]:
+def _areas(regions: Sequence[RescanRegion]) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {}
-    for region in report.regions:
+    for region in regions:
         entry = found.setdefault(region.reason.label, {"count": 0, "area_mm2": 0.0})
         entry["count"] += 1
         entry["area_mm2"] += region.area_mm2

@@ -6,7 +6,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,13 @@ from drivers.scanline import Scanline
 from scanner_service.analysis.errors import AnalysisError
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey, pass_key
+from scanner_service.rescan.followed import RegionBook
+from scanner_service.rescan.reference import ReferenceSurface
+from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.engine import Engine, is_partial
 from scanner_service.sessions.errors import SessionBusy, SessionError
 from scanner_service.sessions.ledger import Ledger
+from scanner_service.sessions.mirror import Mirror, difference_since
 from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.settings import SessionSettings
@@ -33,6 +37,9 @@ ANALYSIS_PERIOD_S = 1.0
 """Regions are looked for about this often during a scan, and less often when one search takes long."""
 
 _STATE_PATIENCE_S = 2.0
+REGIONS_CHANGED = "regions_changed"
+REGIONS_FOLLOWED = "regions_followed"
+"""Events: what became of regions at one verdict; and, when a scan is over, what a later opening goes on with."""
 
 STATES = ("created", "scanning", "paused", "interrupted", "stopped", "failed")
 
@@ -69,6 +76,7 @@ class LiveSession:
         record: Record,
         source: Source,
         clock: Callable[[], float] = time.monotonic,
+        reference: ReferenceSurface | None = None,
     ) -> None:
         self.row = row
         self.settings = SessionSettings.from_dict(row.settings)
@@ -80,6 +88,11 @@ class LiveSession:
         self._state = row.state
         self._message: str | None = None
         self._results: Results | None = None
+        self._reference = reference
+        self._regions = RegionBook()
+        self._following = threading.Lock()
+        self._mirror = Mirror()
+        self._mirroring = threading.Lock()
         self._results_changed = threading.Condition()
         self._lock = threading.RLock()
         self._begun_s: float | None = None
@@ -119,6 +132,9 @@ class LiveSession:
                 damaged.append(f"line {number}: {error}")
             partial[pass_key(line)] += is_partial(line)
             on_progress(number)
+        for event in events:
+            if event.kind == REGIONS_FOLLOWED:
+                self._regions = RegionBook.from_dict(event.details)
         for key in withdrawn_passes(events):
             self.engine.withdraw_pass(key)
         kept = self._record.ledger(self.row.session_id)
@@ -348,11 +364,16 @@ class LiveSession:
             lines=ledger.stored,
             points=ledger.counted,
             points_per_s=ledger.counted / elapsed if elapsed > 0 else 0.0,
-            coverage=results.coverage.share if results is not None else float("nan"),
+            coverage=results.share if results is not None else float("nan"),
             progress=self.source.progress(),
             losses=self.losses(),
             durable=durable,
-            message=self.engine.failure or self._disk.message(self._record.writer_state()) or self._message,
+            message=(
+                self.engine.failure
+                or self._disk.message(self._record.writer_state())
+                or self._message
+                or (results.reference_refused if results else None)
+            ),
             held=self._held,
         )
 
@@ -376,6 +397,8 @@ class LiveSession:
             self._judge()
             self._event(SCAN_ENDED, self.losses(), patience_s=5.0)
             self._keep_ledger()
+            with self._following:
+                self._event(REGIONS_FOLLOWED, self._regions.to_dict())
             if failure is not None or self._state == "paused":
                 self._message = failure  # a scan that is over waits for nothing
             self._set_state("failed" if failure is not None else "stopped")
@@ -404,8 +427,15 @@ class LiveSession:
         try:
             if unless is not None and self.engine.ask(lambda engine: engine.live_map.read_version()).result() == unless:
                 return self._results
-            snapshot = self.engine.ask(lambda engine: engine.live_map.snapshot()).result()
-            results = judge(snapshot, self.settings.requirement(), self.source.geometry, self.source.towards_sensor)
+            with self._mirroring:
+                since = self._mirror.version
+                change = self.engine.ask(lambda engine: difference_since(engine.live_map, since)).result()
+                snapshot = self._mirror.apply(change)
+            source = self.source
+            results = judge(
+                snapshot, self.settings.requirement(), source.geometry, source.towards_sensor, self._reference
+            )
+            results = self._follow(results)
             self.engine.ask(
                 lambda engine: self.verdicts.replace(results.verdict, snapshot.version, engine.live_map)
             ).result()
@@ -416,6 +446,33 @@ class LiveSession:
                 self._results = results
             self._results_changed.notify_all()
         return results
+
+    def _follow(self, results: Results) -> Results:
+        """Give the regions the ids they have had, and keep what has changed of them in the record."""
+        with self._following:
+            changes = self._regions.follow(results.snapshot, results.regions)
+            followed = replace(results, regions=self._regions.current, resolved=self._regions.resolved)
+        if changes:
+            self._event(REGIONS_CHANGED, {"changes": [change.to_dict() for change in changes]})
+        return followed
+
+    def mark_region(self, region_id: int, status: RegionStatus, why: str) -> None:
+        """Say of a region that it is unreachable, or that it is not after all; kept in the record.
+
+        Raises
+        ------
+        SessionError : no such region is open.
+        """
+        with self._following:
+            try:
+                changes = self._regions.mark(region_id, status, why)
+            except KeyError:
+                raise SessionError(f"there is no open region {region_id} in this session") from None
+            results = self._results
+            if results is not None:
+                self._results = replace(results, regions=self._regions.current, resolved=self._regions.resolved)
+        if changes:
+            self._event(REGIONS_CHANGED, {"changes": [change.to_dict() for change in changes]})
 
     def _pass_time(self) -> None:
         """The clock of the scan stands still from here on."""

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from scanner_service.analysis.live_map import MapSettings
 from scanner_service.analysis.radius import LiveRule, RadiusSettings
-from scanner_service.rescan.requirement import Requirement
+from scanner_service.rescan.requirement import Requirement, RequirementUnusable
+from scanner_service.storage.formats.reference_mesh import ReferenceSpec
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +17,12 @@ class SessionSettings:
 
     `radius_rule` is `line`, `flexible` or `global`; `uncertainty_mm` is c of Eq. 6.3. `point_spacing_mm` None measures
     it line by line, a number states it, 0 ignores it. `noise_mm` is one standard deviation of the scanner.
-    `density_per_mm2` is the required density, None for half of 1 / (line spacing * point spacing).
+    `target` is what the scan must reach; `density_per_mm2` states its density alone, and may not contradict it.
+    `reference` is the nominal part that coverage is measured against, None when there is none.
+
+    Raises
+    ------
+    RequirementUnusable : what is asked for contradicts itself, or the scanner's own noise.
     """
 
     radius_rule: LiveRule = "line"
@@ -27,10 +33,12 @@ class SessionSettings:
     density_per_mm2: float | None = None
     max_points: int = 20_000_000
     threads: int = 1
+    target: Requirement = field(default_factory=Requirement)
+    reference: ReferenceSpec | None = None
 
     def __post_init__(self) -> None:
         self.map_settings()
-        self.requirement()
+        self.requirement().check_scanner(self.noise_mm)
 
     def map_settings(self) -> MapSettings:
         """The part that the live map is told."""
@@ -44,7 +52,16 @@ class SessionSettings:
 
     def requirement(self) -> Requirement:
         """The part that the rescan regions are judged by."""
-        return Requirement(density_per_mm2=self.density_per_mm2)
+        asked, alone = self.target.density_per_mm2, self.density_per_mm2
+        if asked is not None and alone is not None and asked != alone:
+            raise RequirementUnusable(
+                f"the density is asked for twice, {alone:g} and {asked:g} points/mm²: leave one of them out"
+            )
+        return replace(
+            self.target,
+            density_per_mm2=alone if asked is None else asked,
+            radius_constant_mm=self.uncertainty_mm,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """As it is kept in the record."""
@@ -53,4 +70,11 @@ class SessionSettings:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "SessionSettings":
         """From the record; names that this version does not know raise TypeError."""
-        return cls(**values)
+        target, reference = values.get("target"), values.get("reference")
+        return cls(
+            **{
+                **values,
+                "target": Requirement() if target is None else Requirement.from_dict(target),
+                "reference": None if reference is None else ReferenceSpec(**reference),
+            }
+        )

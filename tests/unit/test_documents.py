@@ -88,6 +88,8 @@ def test_every_setting_of_a_session_is_documented_with_its_default():
         if field.name.endswith("_rad"):
             assert said == "5°"
             assert default == pytest.approx(0.0872664626)
+        elif field.name == "target":
+            assert said == "nothing more"
         else:
             assert said == ("none" if default is None else str(default)), field.name
     assert rows == {}

@@ -91,9 +91,9 @@ def density_map_picture(
     results = results_of(session)
     picture = density_png(
         results.snapshot,
-        results.report.regions,
+        results.regions,
         session_name=session.row.name,
-        coverage=results.coverage.share,
+        coverage=results.share,
         direction=direction,
     )
     return Response(picture, media_type="image/png")
@@ -101,9 +101,16 @@ def density_map_picture(
 
 @router.get("/regions")
 def list_regions(session: Session) -> Response:
-    """The rescan regions, most urgent first."""
+    """The rescan regions, most urgent first, each with its id, status and history; and those that were resolved."""
     results = results_of(session)
-    return answer({"version": results.snapshot.version, **results.report.to_dict()})
+    return answer({"version": results.snapshot.version, **results.regions_dict()})
+
+
+@router.get("/coverage")
+def get_coverage(session: Session) -> Response:
+    """Coverage asked for and reached: of the surface seen, and of the nominal part where there is one."""
+    results = results_of(session)
+    return answer({"version": results.snapshot.version, **results.coverage_dict()})
 
 
 @router.get("/summary")

@@ -1,6 +1,7 @@
 """Sessions: create, list, start, pause, resume, stop, describe, delete; every call is one call of the session book."""
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,8 +24,10 @@ from scanner_service.api.schemas import (
     SessionIn,
 )
 from scanner_service.api.scopes import require
+from scanner_service.rescan.presets import PRESETS
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SourceUnusable
+from scanner_service.sessions.references import open_reference
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, ReplaySpec, RigSpec, SourceSpec
 from scanner_service.storage.formats.recording import ReadOptions
@@ -130,6 +133,12 @@ def list_sessions(
     )
 
 
+@router.get("/presets", dependencies=[viewer])
+def list_presets() -> Response:
+    """Requirements by name, from the loosest to the finest; null is what is not asked for."""
+    return answer({"presets": {name: preset.to_dict() for name, preset in PRESETS.items()}})
+
+
 @router.post("", status_code=201)
 def create_session(
     request: Request,
@@ -143,7 +152,11 @@ def create_session(
     """
     key = creation_key(idempotency_key, who, body)
     spec = spec_of(body.source, request.app.state.service.replay_dir)
-    session = book_of(request).create(body.name, spec, body.settings.to_settings(), body.origin_mm, key=key)
+    settings, reference = body.settings.to_settings(), None
+    if settings.reference is not None:
+        reference, named = open_reference(settings.reference, request.app.state.service.replay_dir)
+        settings = replace(settings, reference=named)
+    session = book_of(request).create(body.name, spec, settings, body.origin_mm, key=key, reference=reference)
     location = {"Location": f"/api/v1/sessions/{session.row.session_id}"}
     return answer(status_answer(session), 201, location)
 

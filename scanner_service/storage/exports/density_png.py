@@ -45,6 +45,7 @@ _STYLES: dict[str, tuple[float, tuple[float, ...]]] = {
     "lost_lines": (0, (7, 2, 1.2, 2, 1.2, 2)),
     "noisy": (0, (3, 1.2)),
     "isolated": (0, (1, 3)),
+    "untouched": (0, (9, 2, 2, 2)),
 }
 _OTHER_STYLE = (0.0, (10.0, 3.0))
 

@@ -58,6 +58,7 @@ export function drawRegions(place, count, regions, chosen, onChoose) {
         element("span.area", {}, significant(region.area_mm2), element("span.unit", {}, "mm²")),
         element("span.density", {}, `${significant(region.measured_per_mm2)} of ${significant(region.required_per_mm2)}`, element("span.unit", {}, "points/mm²")),
         element("span.priority", {}, "priority ", significant(region.priority, 2)),
+        region.status ? element(`span.status.${region.status}`, { title: region.history?.at(-1)?.why ?? null }, region.status) : null,
         element("meter", { min: 0, max: 1, value: share, "aria-label": "measured share of the required density" }),
         region.remedy ? element("span.remedy", {}, region.remedy) : null,
       ),

@@ -23,6 +23,7 @@ export const RESCAN_REASONS = [
   { key: "lost_lines", text: "lost lines", colour: "#ff5d4d", dash: [6, 6] },
   { key: "noisy", text: "noisy", colour: "#22c494", dash: [2, 2] },
   { key: "isolated", text: "isolated", colour: "#b9a5ff", dash: [1, 6] },
+  { key: "untouched", text: "untouched", colour: "#e8e8e8", dash: [8, 3, 2, 3] }, // of a nominal part; no point has it
 ];
 
 export const unreliableReason = (state) => (state >>> 8) & 0xff;

@@ -1,9 +1,13 @@
 """What may be required, and what is refused."""
 
+import json
+
 import numpy as np
 import pytest
 
-from scanner_service.rescan.requirement import Requirement, RequirementUnusable
+from scanner_service.rescan.presets import PRESETS, requirement_of
+from scanner_service.rescan.requirement import Interest, Requirement, RequirementUnusable
+from scanner_service.sessions.settings import SessionSettings
 
 
 def test_by_default_half_of_the_nominal_density_is_required() -> None:
@@ -46,3 +50,38 @@ def test_the_least_area_is_the_one_stated_or_one_square_millimetre_or_the_disc_o
 def test_an_unusable_requirement_is_refused_by_name(field: str, value: float) -> None:
     with pytest.raises(RequirementUnusable, match=field):
         Requirement(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ({"line_spacing_mm": 0.04}, "finest_line_spacing_mm"),
+        ({"chord_error_mm": 0.01, "noise_mm": 0.02}, "chord error"),
+        ({"incidence_rad": 2.0}, "incidence"),
+        ({"coverage_share": 1.5}, "coverage_share"),
+        ({"chord_error_mm": float("nan")}, "chord_error_mm"),
+        ({"region_area_mm2": 50.0, "interest": Interest((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))}, "region of interest"),
+        ({"preset": "finest"}, "presets are"),
+    ],
+)
+def test_requirements_that_contradict_themselves_are_refused_with_the_reason(asked: dict, says: str) -> None:
+    with pytest.raises(RequirementUnusable, match=says):
+        requirement_of(**asked)
+
+
+def test_a_requirement_below_the_scanner_s_own_noise_is_refused_and_an_empty_box_too() -> None:
+    with pytest.raises(RequirementUnusable, match="own noise"):
+        SessionSettings(noise_mm=0.05, target=Requirement(noise_mm=0.02))
+    with pytest.raises(RequirementUnusable, match="twice"):
+        SessionSettings(density_per_mm2=10.0, target=Requirement(density_per_mm2=12.0))
+    with pytest.raises(RequirementUnusable, match="empty"):
+        Interest((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_presets_survive_the_record(name: str) -> None:
+    asked = requirement_of(name, interest=Interest((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)))
+    settings = SessionSettings(target=asked, noise_mm=0.001)
+    kept = json.loads(json.dumps(settings.to_dict(), allow_nan=False))
+    assert SessionSettings.from_dict(kept) == settings
+    assert settings.requirement().coverage_share == PRESETS[name].coverage_share

@@ -1,0 +1,319 @@
+"""What is true of a part under a scanner, by dense ray casting on its mesh; imports neither service nor simulators.
+
+The surface is sampled densely, and for every sample the sensor is put where its laser plane holds the sample. Then each
+reason's truth is an inequality (`truth_of`):
+
+    visible       n·u >= cos 80° and n·v > 0 (u, v: unit vectors to laser and camera), neither sight blocked, in the
+                  fan, z_low <= z <= z_high, station within the sweep
+    Δs'           g·|t·m| / sqrt(1 - (n·m)²), g the gap between the two lines around the sample
+    δp'           D·dα / |d·e|: the angle between rays times the distance, on the surface (d along the line, e across
+                  the ray)
+    lost_lines    visible, line numbers missing in the gap, g > 1.5 Δs, 1/(Δs'·δp') < ρ
+    steep         visible, not lost, Δs'/g > sqrt(2) + c/Δs, or 1/(Δs'·δp') < ρ at an incidence of more than 60°
+    sparse        visible, neither of these, 1/(Δs'·δp') < ρ
+    out_of_range  visible but for z < z_low or z > z_high
+    shadow        in the fan and in range, neither visible nor grazing, but beside what is: in some direction one looks
+                  from it into the space between the laser and visible surface (so the end of the part is none, nor is
+                  a cavity that no gap in the scan betrays; the walls of a hole right through are, as one looks up out
+                  of it, though no verdict calls them a shadow: they count as missed)
+    noisy         visible, and the noise there above the limit
+
+Beyond 80° fewer than half of the rays return: such `grazing` surface may be seen or not, and is left out. ρ is the
+required density less 5 % (what a scan cannot tell). `band_of` marks the samples within one radius of a sample of the
+other truth.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh as EmbreeTriangles
+from scipy.spatial import cKDTree
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
+
+_LIFT_MM = 0.01  # sights start this far off the surface: rays are cast in single precision
+_GRAZING = 0.5  # cosine of 60°
+_WALL = float(np.cos(np.radians(80.0)))
+_SLACK = 1.05
+_DIRECTIONS = 32
+_FAR_MM = 25.0  # how far a shadow's surface looks for the space beside it
+REASONS = ("steep", "sparse", "lost_lines", "out_of_range", "shadow", "noisy")
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """A laser-line scanner in its sensor frame: laser plane y = 0, x along the line, z towards the sensor.
+
+    `laser_mm`, `camera_mm` (3,); the fan's `rays` cut z = 0 at equal steps over `field_of_view_mm`.
+    """
+
+    laser_mm: Floats
+    camera_mm: Floats
+    field_of_view_mm: float
+    range_mm: tuple[float, float]
+    rays: int
+
+    @property
+    def point_spacing_mm(self) -> float:
+        """Distance of neighbouring rays at z = 0."""
+        return self.field_of_view_mm / (self.rays - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One motion of the sensor along a straight line, part frame.
+
+    At station s the sensor's origin is `origin_mm + s · travel` (3,), its axes the columns of `rotation` (3, 3).
+    `stations_mm` (L,) rise, one a line that arrived; `numbers` (L,) are the lines' numbers, so that a step above 1 is a
+    loss; `line_spacing_mm` is nominal.
+    """
+
+    rotation: Floats
+    origin_mm: Floats
+    travel: Floats
+    stations_mm: Floats
+    numbers: Ints
+    line_spacing_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Surface at random places: `points_mm`, outward unit `normals` (n, 3), each standing for `area_mm2` mm²."""
+
+    points_mm: Floats
+    normals: Floats
+    area_mm2: float
+
+    def __len__(self) -> int:
+        return len(self.points_mm)
+
+
+class Caster:
+    """Rays against a mesh: how far the first hit is, and on which triangle."""
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        corners = np.asarray(mesh.triangles, dtype=np.float64)
+        self.normals: Floats = np.asarray(mesh.face_normals, dtype=np.float64)
+        self._centre = corners.reshape(-1, 3).mean(axis=0)
+        self._scene = rtcore_scene.EmbreeScene()
+        self._triangles = EmbreeTriangles(self._scene, (corners - self._centre).astype(np.float32))
+
+    def distance_mm(self, origins_mm: Floats, directions: Floats) -> Floats:
+        """(n,) distance to the first hit of unit directions (n, 3); inf where there is none."""
+        if not len(origins_mm):
+            return np.zeros(0)
+        start = np.ascontiguousarray(origins_mm - self._centre, dtype=np.float32)
+        found = self._scene.run(start, np.ascontiguousarray(directions, dtype=np.float32), query="DISTANCE")
+        distance = np.asarray(found, dtype=np.float64)
+        return np.where(distance < 1e30, distance, np.inf)
+
+    def triangle(self, origins_mm: Floats, directions: Floats) -> Ints:
+        """(n,) index of the triangle first hit; -1 where there is none."""
+        if not len(origins_mm):
+            return np.zeros(0, dtype=np.int64)
+        start = np.ascontiguousarray(origins_mm - self._centre, dtype=np.float32)
+        return np.asarray(self._scene.run(start, np.ascontiguousarray(directions, dtype=np.float32)), dtype=np.int64)
+
+    def is_free(self, origins_mm: Floats, targets_mm: Floats) -> Bools:
+        """(n,) True where nothing stands between origin and target (n, 3)."""
+        way = targets_mm - origins_mm
+        length = np.linalg.norm(way, axis=1)
+        return np.asarray(self.distance_mm(origins_mm, way / length[:, None]) >= length)
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What a sweep sees of each sample; arrays of n rows.
+
+    `station_mm` is where the laser plane holds the sample, `angle_rad` its place in the fan, `lit` whether the laser
+    reaches it (turned to it by at least 10°, nothing in between), `camera` whether the camera does (at any angle),
+    `grazing` whether both do, but the laser at less than 10°,
+    `in_fan` and `in_range` whether fan, sweep and measurement range hold it. `incidence_rad` is the angle of normal and
+    laser ray, `stretch` = |t·m| / sqrt(1 - (n·m)²), `along_mm` the spacing δp' of the rays on the surface, `laser_mm`
+    (n, 3) where the laser then stands.
+    """
+
+    station_mm: Floats
+    angle_rad: Floats
+    lit: Bools
+    camera: Bools
+    grazing: Bools
+    in_fan: Bools
+    in_range: Bools
+    incidence_rad: Floats
+    stretch: Floats
+    along_mm: Floats
+    laser_mm: Floats
+
+    @property
+    def visible(self) -> Bools:
+        """(n,) True where laser and camera see the sample within fan and range."""
+        return self.lit & self.camera & self.in_fan & self.in_range
+
+    def scannable(self, incidence_rad: float) -> Bools:
+        """(n,) True where the sample is visible at no more than an incidence angle."""
+        return np.asarray(self.visible & (self.incidence_rad <= incidence_rad))
+
+
+def sample_surface(mesh: trimesh.Trimesh, spacing_mm: float, seed: int = 1) -> Samples:
+    """Uniformly random samples, one for each square of the spacing."""
+    count = max(1, int(mesh.area / spacing_mm**2))
+    points, face = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    normals = np.asarray(mesh.face_normals, dtype=np.float64)[face]
+    return Samples(np.asarray(points, dtype=np.float64), normals, float(mesh.area) / count)
+
+
+def scan_coordinates(points_mm: Floats, optics: Optics, sweep: Sweep) -> tuple[Floats, Floats]:
+    """Station (n,) at which the laser plane holds each point (n, 3), and its angle (n,) in the fan."""
+    m = sweep.rotation[:, 1]
+    station = (points_mm - sweep.origin_mm) @ m / float(sweep.travel @ m)
+    own = _in_sensor(points_mm, station, sweep)
+    return station, np.arctan2(own[:, 0] - optics.laser_mm[0], optics.laser_mm[2] - own[:, 2])
+
+
+def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> Sight:
+    """Cast both sights of every sample from where its laser plane holds it."""
+    m, t = sweep.rotation[:, 1], sweep.travel
+    points, normals = samples.points_mm, samples.normals
+    station, angle = scan_coordinates(points, optics, sweep)
+    own = _in_sensor(points, station, sweep)
+    base = sweep.origin_mm + station[:, None] * t
+    laser = base + optics.laser_mm @ sweep.rotation.T
+    camera = base + optics.camera_mm @ sweep.rotation.T
+    lifted = points + _LIFT_MM * normals
+    to_laser = laser - points
+    distance = np.linalg.norm(to_laser, axis=1)
+    to_laser = to_laser / distance[:, None]
+    cosine = np.einsum("ij,ij->i", normals, to_laser)
+    reached = cosine > 1e-6
+    reached[reached] = caster.is_free(lifted[reached], laser[reached])
+    lit = reached & (cosine >= _WALL)
+    seen = np.einsum("ij,ij->i", normals, camera - points) > 0
+    seen[seen] = caster.is_free(lifted[seen], camera[seen])
+    height = float(optics.laser_mm[2])
+    within = (station >= sweep.stations_mm[0]) & (station <= sweep.stations_mm[-1])
+    along_line = np.cross(normals, m)
+    sine = np.linalg.norm(along_line, axis=1)
+    across_ray = np.cross(to_laser, m)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        step_rad = optics.point_spacing_mm * np.cos(angle) ** 2 / height
+        share = np.abs(np.einsum("ij,ij->i", along_line, across_ray)) / sine
+        along = distance * step_rad / share
+        stretch = abs(float(t @ m)) / sine
+    return Sight(
+        station_mm=station,
+        angle_rad=angle,
+        lit=lit,
+        camera=seen,
+        grazing=reached & ~lit & seen,
+        in_fan=_fan_holds(own, optics) & within,
+        in_range=(own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1]),
+        incidence_rad=np.arccos(np.clip(cosine, -1.0, 1.0)),
+        stretch=np.nan_to_num(stretch, nan=np.inf),
+        along_mm=np.nan_to_num(along, nan=np.inf),
+        laser_mm=laser,
+    )
+
+
+def truth_of(
+    caster: Caster,
+    samples: Samples,
+    sight: Sight,
+    optics: Optics,
+    sweep: Sweep,
+    density_per_mm2: float,
+    constant_mm: float = 0.1,
+    is_noisy: Callable[[Floats], Bools] | None = None,
+) -> dict[str, Bools]:
+    """Of each reason, which samples (n,) it is true of; at most one holds, but for `noisy`."""
+    visible = sight.visible
+    after = np.clip(np.searchsorted(sweep.stations_mm, sight.station_mm), 1, len(sweep.stations_mm) - 1)
+    gap = sweep.stations_mm[after] - sweep.stations_mm[after - 1]
+    missing = sweep.numbers[after] - sweep.numbers[after - 1] > 1
+    with np.errstate(divide="ignore"):
+        is_thin = 1.0 / (gap * sight.stretch * sight.along_mm) < density_per_mm2 / _SLACK
+    lost = visible & missing & (gap > 1.5 * sweep.line_spacing_mm) & is_thin
+    beyond = sight.stretch > np.sqrt(2.0) + constant_mm / sweep.line_spacing_mm
+    steep = visible & ~lost & (beyond | (is_thin & (np.cos(sight.incidence_rad) < _GRAZING)))
+    noisy = visible & is_noisy(samples.points_mm) if is_noisy is not None else np.zeros(len(samples), dtype=bool)
+    return {
+        "steep": steep,
+        "sparse": visible & ~lost & ~steep & is_thin,
+        "lost_lines": lost,
+        "out_of_range": sight.lit & sight.camera & sight.in_fan & ~sight.in_range,
+        "shadow": _shadow(caster, samples, sight, optics, sweep),
+        "noisy": noisy,
+    }
+
+
+def _shadow(caster: Caster, samples: Samples, sight: Sight, optics: Optics, sweep: Sweep) -> Bools:
+    """Hidden surface beside what is seen: from it one looks into the space between the laser and seen surface."""
+    shadow = np.zeros(len(samples), dtype=bool)
+    hidden = np.flatnonzero(sight.in_fan & sight.in_range & ~sight.visible & ~sight.grazing)
+    rng = np.random.default_rng(2)
+    for number in range(_DIRECTIONS):
+        left = hidden[~shadow[hidden]]
+        normals = samples.normals[left]
+        way = rng.normal(size=(len(left), 3))
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        way = normals.copy() if number == 0 else way + 1.02 * normals
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        start = samples.points_mm[left] + _LIFT_MM * normals
+        free = np.minimum(caster.distance_mm(start, way), _FAR_MM)
+        for share in (0.1, 0.35, 0.65, 0.95):
+            open_ = ~shadow[left]
+            there = start[open_] + share * free[open_, None] * way[open_]
+            shadow[left[open_]] = _is_looked_through(caster, there, optics, sweep)
+    return shadow
+
+
+def _is_looked_through(caster: Caster, places_mm: Floats, optics: Optics, sweep: Sweep) -> Bools:
+    """(n,) True for places in the air that the laser reaches, with seen surface behind."""
+    t = sweep.travel
+    station = scan_coordinates(places_mm, optics, sweep)[0]
+    base = sweep.origin_mm + station[:, None] * t
+    laser, camera = base + optics.laser_mm @ sweep.rotation.T, base + optics.camera_mm @ sweep.rotation.T
+    ray = places_mm - laser
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    distance, face = caster.distance_mm(laser, ray), caster.triangle(laser, ray)
+    past = np.isfinite(distance) & (face >= 0) & (distance > np.linalg.norm(places_mm - laser, axis=1))
+    past &= (station >= sweep.stations_mm[0]) & (station <= sweep.stations_mm[-1])
+    foot = laser[past] + distance[past, None] * ray[past]
+    normals = caster.normals[face[past]]
+    own = _in_sensor(foot, station[past], sweep)
+    seen = -np.einsum("ij,ij->i", normals, ray[past]) >= _WALL
+    seen &= (np.einsum("ij,ij->i", normals, camera[past] - foot) > 0) & _fan_holds(own, optics)
+    seen &= (own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1])
+    seen[seen] = caster.is_free((foot + _LIFT_MM * normals)[seen], camera[past][seen])
+    looked = np.zeros(len(places_mm), dtype=np.bool_)
+    looked[np.flatnonzero(past)[seen]] = True
+    return looked
+
+
+def _fan_holds(own_mm: Floats, optics: Optics) -> Bools:
+    """(n,) True for points (n, 3) of the sensor frame within the fan."""
+    height = float(optics.laser_mm[2])
+    at_zero = optics.laser_mm[0] + (own_mm[:, 0] - optics.laser_mm[0]) * height / (height - own_mm[:, 2])
+    return np.asarray(np.abs(at_zero) <= 0.5 * optics.field_of_view_mm)
+
+
+def band_of(samples: Samples, truth: Bools, radius_mm: float) -> Bools:
+    """(n,) True within a radius of a sample of the other truth."""
+    band = np.zeros(len(samples), dtype=bool)
+    if truth.any() and not truth.all():
+        for mine, others in ((truth, ~truth), (~truth, truth)):
+            away = cKDTree(samples.points_mm[others]).query(samples.points_mm[mine], distance_upper_bound=radius_mm)[0]
+            band[mine] = np.isfinite(away)
+    return band
+
+
+def _in_sensor(points_mm: Floats, station_mm: Floats, sweep: Sweep) -> Floats:
+    """Points (n, 3) in the sensor frame of the station given for each."""
+    offset: Floats = points_mm - sweep.origin_mm - station_mm[:, None] * sweep.travel
+    return np.asarray(offset @ sweep.rotation, dtype=np.float64)

@@ -1,0 +1,92 @@
+"""Regions keep their ids while a scan grows, and go through their states; what happened is kept."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+
+from scanner_service.rescan.followed import RegionBook
+from scanner_service.rescan.judgement import Reason
+from scanner_service.rescan.region import RegionStatus
+from scanner_service.rescan.regions import find_regions
+from tests.unit.rescan.synthetic_scan import Scan, snapshot_of, straight_down
+
+X, Y = np.arange(-4, 4, 0.2), np.arange(0, 14, 0.3)
+
+
+def _ramps(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Two flanks of 70 degrees, 2 mm wide, at y = 3 and y = 9."""
+    rise = np.tan(np.radians(70.0))
+    return rise * (np.clip(y - 3.0, 0.0, 2.0) + np.clip(y - 9.0, 0.0, 2.0))
+
+
+def _first(scan: Scan, lines: int) -> Scan:
+    parts = {name: getattr(scan, name)[:lines] for name in scan.__dataclass_fields__ if name != "places"}
+    return Scan(**parts, places=scan.places)
+
+
+def _followed(book: RegionBook, scan: Scan, version: int, unsettled_beyond: float | None = None) -> list:
+    waits = None if unsettled_beyond is None else (lambda points: points[:, 1] > unsettled_beyond)
+    snapshot = replace(snapshot_of(scan, unsettled=waits), version=version)
+    return book.follow(snapshot, find_regions(snapshot).regions)
+
+
+def test_ids_stay_while_the_scan_grows() -> None:
+    book, scan = RegionBook(), straight_down(_ramps, X, Y, 0.3)
+    seen: dict[int, list[float]] = {}
+    for version, lines in enumerate(range(8, len(Y) + 1, 3), start=1):
+        _followed(book, _first(scan, lines), version, unsettled_beyond=float(Y[lines - 1]) - 1.0)
+        for region in book.current:
+            seen.setdefault(region.region_id, []).append(float(region.centroid_mm[1]))
+    assert sorted(seen) == [1, 2]
+    assert all(3.0 < y < 5.0 for y in seen[1]) and all(9.0 < y < 11.0 for y in seen[2])
+    assert [region.status for region in book.current] == [RegionStatus.OPEN] * 2
+
+
+def test_a_pass_over_a_region_makes_it_rescanned_when_it_fails_still_and_resolved_when_it_does_not() -> None:
+    book, scan = RegionBook(), straight_down(_ramps, X, Y, 0.3)
+    _followed(book, scan, 1)
+    ids = {region.region_id for region in book.current}
+    # the same again half way in between mends nothing on the first flank (too few lines), a fine pass mends the second
+    coarse = straight_down(_ramps, X, np.arange(2.15, 6.0, 1.2), 1.2, pass_number=2)
+    fine = straight_down(_ramps, X, np.arange(8.0, 12.0, 0.05), 0.05, pass_number=3)
+    changes = _followed(book, scan.joined(coarse).joined(fine), 2)
+    by_id = {region.region_id: region for region in (*book.current, *book.resolved)}
+    first, second = (by_id[key] for key in sorted(ids))
+    assert first.status is RegionStatus.RESCANNED
+    assert second.status is RegionStatus.RESOLVED
+    assert [moment.status for moment in second.history] == [RegionStatus.OPEN, RegionStatus.RESOLVED]
+    assert {change.region_id for change in changes} >= ids
+    # withdrawn again: it fails again, under the id that it had
+    _followed(book, scan.joined(coarse), 3)
+    assert {region.region_id for region in book.current} >= ids
+    assert json.dumps([change.to_dict() for change in changes], allow_nan=False)
+
+
+def test_a_region_whose_points_wait_is_not_called_resolved() -> None:
+    book, scan = RegionBook(), straight_down(_ramps, X, Y, 0.3)
+    _followed(book, scan, 1)
+    _followed(book, scan, 2, unsettled_beyond=8.0)
+    assert len(book.current) == 2 and not book.resolved
+
+
+def test_unreachable_is_said_with_a_reason_and_an_old_report_changes_nothing() -> None:
+    book, scan = RegionBook(), straight_down(_ramps, X, Y, 0.3)
+    _followed(book, scan, 5)
+    book.mark(1, RegionStatus.UNREACHABLE, "no pose within the limits sees it")
+    _followed(book, scan, 4)
+    _followed(book, scan, 6)
+    region = next(region for region in book.current if region.region_id == 1)
+    assert region.status is RegionStatus.UNREACHABLE
+    assert region.history[-1].why == "no pose within the limits sees it"
+
+
+def test_a_book_goes_on_where_another_was_kept() -> None:
+    book, scan = RegionBook(), straight_down(_ramps, X, Y, 0.3)
+    _followed(book, scan, 1)
+    book.mark(2, RegionStatus.UNREACHABLE, "hidden")
+    again = RegionBook.from_dict(json.loads(json.dumps(book.to_dict(), allow_nan=False)))
+    _followed(again, scan, 1)
+    mine, others = book.current, again.current
+    assert [(r.region_id, r.status, r.history) for r in mine] == [(r.region_id, r.status, r.history) for r in others]
+    assert all(region.reason is Reason.STEEP for region in others)
