@@ -5,7 +5,7 @@ JSON ?= $(OUT)/live-map.json
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
-WORKERS ?= 2
+WORKERS ?= 4
 
 .PHONY: demo test test-long faults fuzz lint bench clean
 .DELETE_ON_ERROR:

@@ -22,7 +22,6 @@ from scanner_service.commands.terminal import (
 from scanner_service.rescan.presets import requirement_of
 from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.sessions.book import SessionBook
-from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.outputs import OUTPUT_FILES, write_outputs
 from scanner_service.sessions.references import open_reference
 from scanner_service.sessions.session import LiveSession
@@ -112,10 +111,8 @@ def replay_command(
             play(live, quiet=as_json)
             summary = write_outputs(out, live)
             results = live.results()
-            if results is not None:
-                if results.reference_refused is not None:
-                    raise ValueError(results.reference_refused)
-                summary["verdict_sha256"] = verdict_sha256(results)
+            if results is not None and results.reference_refused is not None:
+                raise ValueError(results.reference_refused)
         if as_json:
             show_json(summary)
         elif results is not None:

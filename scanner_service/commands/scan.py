@@ -52,4 +52,4 @@ def scan_command(
         if as_json:
             show_json(summary)
         elif results is not None:
-            tell(results.report.to_dict()["regions"], summary, out)
+            tell(results.regions_dict()["regions"], summary, out)

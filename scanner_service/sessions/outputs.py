@@ -7,6 +7,7 @@ from typing import Any
 
 from scanner_service import __version__
 from scanner_service.sessions.errors import SessionError
+from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.results import Results, summarise
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.stored import StoredSession
@@ -42,7 +43,8 @@ def stored_outcome(stored: StoredSession) -> Outcome:
 def summary_of(outcome: Outcome) -> dict[str, Any]:
     """The content of summary.json."""
     head = {"session": outcome.row.session_id, "name": outcome.row.name, "state": outcome.state}
-    return head | summarise(outcome.results, outcome.losses, outcome.points_per_s, __version__)
+    told = summarise(outcome.results, outcome.losses, outcome.points_per_s, __version__)
+    return head | told | {"verdict_sha256": verdict_sha256(outcome.results)}
 
 
 def _points(path: Path, outcome: Outcome) -> None:

@@ -181,7 +181,7 @@ async def _send_status(websocket: WebSocket, session: LiveSession, greeted: asyn
         greeted.set()
         results = session.results()
         if results is not None and results is not told:
-            regions = [region.to_dict() for region in results.report.regions]
+            regions = [region.to_dict() for region in results.regions]
             await _say(websocket, {"type": "regions", "version": results.snapshot.version, "regions": regions})
             told = results
         if is_final:
