@@ -5,11 +5,14 @@ It opens device files only: what a user writes is never taken for a URL. It know
 
 import contextlib
 import errno
+import fcntl
 import grp
 import os
 import select
 import stat
+import struct
 import termios
+from dataclasses import dataclass
 from pathlib import Path
 
 import serial
@@ -26,6 +29,22 @@ from drivers.errors import (
 
 _READ_BYTES = 65_536
 _GONE = {errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EIO}
+_TIOCGICOUNT = 0x545D  # Linux: what the adapter counted since it was plugged in
+_ICOUNT = struct.Struct("11i9i")  # the eighth is the UART's overruns, the eleventh those of the kernel's buffer
+_BY_ID = Path("/dev/serial/by-id")
+
+
+@dataclass(frozen=True, slots=True)
+class ModemLines:
+    """How the two lines a host can switch are to stand while the port is open; None leaves one as the system has it.
+
+    Set before the port is opened, because boards exist that reset, and scanners whose motor stops, when a line moves.
+    `hang_up` False keeps them where they are when the port is closed.
+    """
+
+    dtr: bool | None = None
+    rts: bool | None = None
+    hang_up: bool = True
 
 
 class Port:
@@ -36,18 +55,29 @@ class Port:
     PortAbsent, PortBusy, PortNotPermitted, PortNotSerial, PortRateRefused : when it cannot be opened.
     """
 
-    def __init__(self, path: str, baud_rate: int) -> None:
+    def __init__(self, path: str, baud_rate: int, lines: ModemLines = ModemLines()) -> None:
         self.path = path
         _check_device_file(path)
         try:
-            self._serial = serial.Serial(path, baud_rate, timeout=0, write_timeout=0, exclusive=True)
+            self._serial = serial.Serial(None, baud_rate, timeout=0, write_timeout=0, exclusive=True)
+            self._serial.port = path
+            if lines.dtr is not None:
+                self._serial.dtr = lines.dtr
+            if lines.rts is not None:
+                self._serial.rts = lines.rts
+            self._serial.open()
         except ValueError as error:
-            raise PortRateRefused(
-                path, f"{path} refuses {baud_rate} baud ({error}); choose a rate that adapter and scanner both have"
-            ) from error
+            raise _rate_refused(path, baud_rate, error) from error
         except OSError as error:  # SerialException is one
             raise _explain(path, error) from error
+        self.baud_rate = baud_rate
         self._fd: int = self._serial.fileno()
+        self._overruns_at_open = self._read_overruns()
+        if not lines.hang_up:
+            with contextlib.suppress(OSError, termios.error):
+                attributes = termios.tcgetattr(self._fd)
+                attributes[2] &= ~termios.HUPCL
+                termios.tcsetattr(self._fd, termios.TCSANOW, attributes)
         # Where the adapter has no such switch it stays as it is: a matter of latency, not of right or wrong.
         with contextlib.suppress(ValueError, OSError, NotImplementedError):
             self._serial.set_low_latency_mode(True)
@@ -86,15 +116,76 @@ class Port:
         except OSError as error:
             raise self._lost(error) from error
 
+    def set_baud_rate(self, baud_rate: int) -> None:
+        """Go on at another rate; what has not left yet leaves at the new one.
+
+        Raises
+        ------
+        PortRateRefused : when the adapter does not do it; the old rate stays.
+        PortLost : when the port has been pulled out or hung up.
+        """
+        if baud_rate == self.baud_rate:
+            return
+        try:
+            self._serial.baudrate = baud_rate
+        except ValueError as error:
+            self._serial._baudrate = self.baud_rate  # pyserial keeps the refused one, and would refuse for ever
+            raise _rate_refused(self.path, baud_rate, error) from error
+        except (OSError, termios.error) as error:
+            raise self._lost(error) from error
+        self.baud_rate = baud_rate
+
+    def set_dtr(self, on: bool) -> bool:
+        """Switch DTR; False where there is no such line, as on a pseudo-terminal."""
+        try:
+            self._serial.dtr = on
+        except OSError as error:
+            if error.errno in {errno.ENOTTY, errno.EINVAL, errno.ENOTSUP}:
+                return False
+            raise self._lost(error) from error
+        return True
+
+    def overruns(self) -> int | None:
+        """Bytes that UART and kernel dropped since the opening because nobody read in time; None where none count."""
+        now = self._read_overruns()
+        return None if now is None or self._overruns_at_open is None else max(0, now - self._overruns_at_open)
+
     def close(self) -> None:
         """Close at once; bytes still to be sent are discarded, or closing could wait for a dead line for ever."""
         with contextlib.suppress(OSError, termios.error):
             termios.tcflush(self._fd, termios.TCOFLUSH)
         self._serial.close()
 
+    def _read_overruns(self) -> int | None:
+        try:
+            counts = _ICOUNT.unpack(fcntl.ioctl(self._fd, _TIOCGICOUNT, bytes(_ICOUNT.size)))
+        except OSError:
+            return None
+        return int(counts[7] + counts[10])
+
     def _lost(self, error: Exception | None) -> PortLost:
         detail = f" ({error})" if error is not None else ""
         return PortLost(self.path, f"{self.path} was pulled out or hung up{detail}; plug it in again")
+
+
+def lasting_path(path: str, by_id: Path = _BY_ID) -> str:
+    """Return the link in `by_id` that leads to the same device as `path`, else `path`.
+
+    The kernel may give a replugged adapter another number (ttyUSB0 becomes ttyUSB1); the link, made of vendor, product
+    and serial number, then leads to the new one.
+    """
+    try:
+        device = Path(path).resolve(strict=True)
+        links = sorted(link for link in by_id.iterdir() if link.resolve() == device)
+    except (OSError, RuntimeError):
+        return path
+    return path if Path(path).parent == by_id or not links else str(links[0])
+
+
+def _rate_refused(path: str, baud_rate: int, error: Exception) -> PortRateRefused:
+    return PortRateRefused(
+        path, f"{path} refuses {baud_rate} baud ({error}); choose a rate that adapter and scanner both have"
+    )
 
 
 def _check_device_file(path: str) -> None:

@@ -67,7 +67,8 @@ class LineTally:
 class Tally:
     """A moment's accounts of one scanner; `a + b` joins the accounts of two boots, or of two scanners.
 
-    `damage` counts damaged pieces of the stream by reason, `bytes_skipped` their bytes.
+    `damage` counts damaged pieces of the stream by reason, `bytes_skipped` their bytes. `no_return` counts points of
+    stored lines that the device itself gave no distance for, by the reason it told.
     """
 
     chunks: ChunkTally = field(default_factory=ChunkTally)
@@ -77,6 +78,7 @@ class Tally:
     disagreements: int = 0
     damage: dict[str, int] = field(default_factory=dict)
     bytes_skipped: int = 0
+    no_return: dict[str, int] = field(default_factory=dict)
 
     def __add__(self, other: "Tally") -> "Tally":
         a, b = self, other
@@ -96,6 +98,7 @@ class Tally:
             a.disagreements + b.disagreements,
             _join(a.damage, b.damage),
             a.bytes_skipped + b.bytes_skipped,
+            _join(a.no_return, b.no_return),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -115,6 +118,7 @@ class Tally:
             "disagreements": self.disagreements,
             "damage": dict(self.damage),
             "bytes_skipped": self.bytes_skipped,
+            "no_return": dict(self.no_return),
         }
 
 
@@ -171,6 +175,7 @@ class BootLedger:
         self._duplicates = self._stale = self._disagreements = 0
         self._damage: Counter[str] = Counter()
         self._bytes_skipped = 0
+        self._no_return: Counter[str] = Counter()
 
     def chunk(self, sequence: int, line: int, dropped_chunks: int, dropped_lines: int) -> Arrival:
         """Enter a chunk that was read, as stored; what comes of it otherwise is told by `not_kept`."""
@@ -211,6 +216,10 @@ class BootLedger:
         """Enter that the link is down: the gap until the next chunk is `disconnected`."""
         self._cause = "disconnected"
 
+    def no_return(self, counts: dict[str, int]) -> None:
+        """Enter points of a line that the device gave no distance for, by reason."""
+        self._no_return.update(counts)
+
     def not_kept(self, reason: str) -> None:
         """Move a chunk entered as stored to the lost ones."""
         self._stored -= 1
@@ -249,6 +258,7 @@ class BootLedger:
             self._disagreements,
             _nonzero(self._damage),
             self._bytes_skipped,
+            _nonzero(self._no_return),
         )
 
     def _advance(self, number: int, dropped_chunks: int) -> str:

@@ -1,1 +1,1 @@
-"""One small file a scanner: its protocol on a port, and the verbs enter, stream, exit."""
+"""One small file a scanner: protocol and port, and the verbs enter, stream, exit; `known.py` has them by name."""

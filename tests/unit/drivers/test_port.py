@@ -2,6 +2,7 @@
 
 import os
 import pty
+import termios
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from drivers.errors import (
     PortNotSerial,
     PortRateRefused,
 )
-from drivers.port import Port, _explain
+from drivers.port import ModemLines, Port, _explain, lasting_path
 
 
 @pytest.fixture
@@ -127,3 +128,40 @@ def test_a_port_nobody_reads_takes_what_it_can_and_never_waits(terminal: tuple[i
     assert written[-1] == 0
     assert sum(written) > 0
     port.close()
+
+
+def test_the_rate_of_an_open_port_can_be_changed_and_a_refused_one_leaves_the_old(terminal: tuple[int, str]) -> None:
+    master, path = terminal
+    port = Port(path, 9_600)
+    port.set_baud_rate(38_400)
+    assert termios.tcgetattr(master)[5] == termios.B38400
+    port.set_baud_rate(256_000)  # no constant of POSIX has it
+    with pytest.raises(PortRateRefused, match="refuses -1 baud"):
+        port.set_baud_rate(-1)
+    assert port.baud_rate == 256_000
+    port.set_baud_rate(19_200)
+    assert termios.tcgetattr(master)[5] == termios.B19200
+    port.close()
+
+
+def test_modem_lines_that_are_not_there_are_no_error(terminal: tuple[int, str]) -> None:
+    _, path = terminal
+    port = Port(path, 115_200, ModemLines(dtr=False, rts=False, hang_up=False))
+    assert port.set_dtr(True) is False
+    assert port.overruns() is None
+    assert not termios.tcgetattr(port._fd)[2] & termios.HUPCL
+    port.close()
+
+
+def test_a_port_is_found_again_by_its_link_when_its_number_changes(tmp_path: Path) -> None:
+    by_id = tmp_path / "by-id"
+    by_id.mkdir()
+    first, second = tmp_path / "ttyUSB0", tmp_path / "ttyUSB1"
+    first.touch()
+    link = by_id / "usb-Maker_Scanner_0001-if00-port0"
+    link.symlink_to(first)
+    assert lasting_path(str(first), by_id) == str(link)
+    assert lasting_path(str(link), by_id) == str(link)
+    second.touch()
+    assert lasting_path(str(second), by_id) == str(second)
+    assert lasting_path(str(tmp_path / "gone"), by_id) == str(tmp_path / "gone")

@@ -246,6 +246,7 @@ def test_tallies_of_boots_add_up_and_are_json() -> None:
     ledger = BootLedger()
     ledger.chunk(3, 1, 1, 1)
     ledger.damage("bad_crc", 5)
+    ledger.no_return({"too_far": 3, "dazzled": 0})
     one = ledger.tally()
     two = one + one + Tally()
     assert two.chunks.balances
@@ -258,6 +259,7 @@ def test_tallies_of_boots_add_up_and_are_json() -> None:
         "disagreements": 0,
         "damage": {"bad_crc": 2},
         "bytes_skipped": 10,
+        "no_return": {"too_far": 6},
     }
 
 
