@@ -15,6 +15,17 @@ DriverError
 |   |-- ScannerRefused          a command was refused, with the reason
 |   |-- ScannerNotConnected     a command was given while no device is there
 |   `-- ProtocolUnsupported     the device speaks another version of the protocol
+|-- StageError                  what moves, behind its tty
+|   |-- StageSilent             nothing intelligible answers
+|   |-- StageTimeout            a command was not acknowledged
+|   |-- StageRefused            the controller refused a command, with the reason
+|   |-- StageAlarm              the controller has locked itself
+|   |-- StageStopped            a motion was ended by a stop
+|   |-- StageNotConnected       a command was given while no controller is there
+|   |-- StageLimit              a target outside the soft limits; nothing was sent
+|   `-- StagePositionUnknown    a motion was asked for before homing; nothing was sent
+|-- RigInvalid                  a rig file that cannot be meant; `problems` names all of them
+|-- DriverUnknown               no driver of that name is installed
 `-- PositionUnknown             a profile cannot be placed without its stage position
 """
 
@@ -85,3 +96,53 @@ class ProtocolUnsupported(ScannerError):
 
 class PositionUnknown(DriverError):
     """A profile cannot be placed on the part without its stage position."""
+
+
+class StageError(DriverError):
+    """Something is wrong with what moves, or with its controller."""
+
+
+class StageSilent(StageError):
+    """Nothing intelligible answers."""
+
+
+class StageTimeout(StageError):
+    """A command was not acknowledged in time."""
+
+
+class StageRefused(StageError):
+    """The controller refused a command; the message says why."""
+
+
+class StageAlarm(StageError):
+    """The controller has locked itself; the message says why, and what frees it."""
+
+
+class StageStopped(StageError):
+    """A motion was ended by a stop before its target."""
+
+
+class StageNotConnected(StageError):
+    """A command was given while no controller is there."""
+
+
+class StageLimit(StageError):
+    """A target outside the soft limits; nothing was sent."""
+
+
+class StagePositionUnknown(StageError):
+    """A motion was asked for while the position is unknown; nothing was sent."""
+
+
+class RigInvalid(DriverError):
+    """A rig file that cannot be meant; `problems` holds one sentence for each thing that is wrong."""
+
+    def __init__(self, source: str, problems: tuple[str, ...]) -> None:
+        self.source = source
+        self.problems = problems
+        listed = problems[0] if len(problems) == 1 else "".join(f"\n  - {problem}" for problem in problems)
+        super().__init__(f"{source}: {listed}")
+
+
+class DriverUnknown(DriverError):
+    """No driver of that name is installed."""

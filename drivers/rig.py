@@ -1,5 +1,6 @@
 """Where scanner, stage and part stand to each other: profiles and stage positions become scanlines; knows no device."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,28 +13,78 @@ def _along_y() -> Float64Array:
     return np.array([0.0, 1.0, 0.0])
 
 
+def _check_unit_vector(name: str, vector: Float64Array) -> None:
+    if vector.shape != (3,) or not abs(float(np.linalg.norm(vector)) - 1) < 1e-6:
+        raise ValueError(f"{name} must be a unit vector (3,), not {np.asarray(vector).tolist()}")
+
+
+@dataclass(frozen=True, slots=True)
+class Turntable:
+    """An axis of rotation through the origin of the stage frame.
+
+    `axis_stage` (3,) is a unit vector: seen from the part, the sensor goes around it by the right-hand rule as the
+    position grows. `radius_mm` is where line spacings are stated: a position is the arc there, angle times radius.
+    """
+
+    axis_stage: Float64Array
+    radius_mm: float
+
+    def __post_init__(self) -> None:
+        _check_unit_vector("axis_stage", self.axis_stage)
+        if not (math.isfinite(self.radius_mm) and self.radius_mm > 0):
+            raise ValueError(f"the radius of a turntable must be greater than 0 mm, not {self.radius_mm}")
+        read_only(self.axis_stage)
+
+    def turn(self, position_mm: float) -> Pose:
+        """Return the rotation about the axis at a position (Rodrigues' formula)."""
+        x, y, z = self.axis_stage
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        angle_rad = position_mm / self.radius_mm
+        rotation = np.eye(3) + math.sin(angle_rad) * cross + (1.0 - math.cos(angle_rad)) * (cross @ cross)
+        return Pose(rotation, np.zeros(3))
+
+    def tangent(self, at_stage_mm: Float64Array, otherwise: Float64Array) -> Float64Array:
+        """Return the unit direction (3,) in which a place of the stage frame goes around; on the axis `otherwise`."""
+        across = np.cross(self.axis_stage, at_stage_mm)
+        length = float(np.linalg.norm(across))
+        return across / length if length > 1e-6 else otherwise
+
+
 @dataclass(frozen=True, slots=True)
 class Rig:
     """A sensor on a stage before a part; the default mounts everything alike, so that part = (x, position, z).
 
     At stage position s the sensor stands at `part_from_stage @ shift(s * travel_stage) @ stage_from_sensor`.
     `travel_stage` (3,) is a unit vector in the stage frame: where the sensor goes, seen from the part, as s grows. A
-    rig whose part moves instead has the opposite vector.
+    rig whose part moves instead has the opposite vector. With a `turntable` the shift is its turn, and `travel_stage`
+    has no meaning.
     """
 
     part_from_stage: Pose = field(default_factory=Pose.identity)
     stage_from_sensor: Pose = field(default_factory=Pose.identity)
     travel_stage: Float64Array = field(default_factory=_along_y)
+    turntable: Turntable | None = None
 
     def __post_init__(self) -> None:
-        if self.travel_stage.shape != (3,) or not abs(float(np.linalg.norm(self.travel_stage)) - 1) < 1e-6:
-            raise ValueError(f"travel_stage must be a unit vector (3,), not {np.asarray(self.travel_stage).tolist()}")
+        _check_unit_vector("travel_stage", self.travel_stage)
         read_only(self.travel_stage)
 
     def part_from_sensor(self, position_mm: float) -> Pose:
         """Return the sensor's pose at a stage position."""
-        shift = Pose(np.eye(3), position_mm * self.travel_stage)
-        return self.part_from_stage @ shift @ self.stage_from_sensor
+        return self.part_from_stage @ self._shift(position_mm) @ self.stage_from_sensor
+
+    def _shift(self, position_mm: float) -> Pose:
+        if self.turntable is not None:
+            return self.turntable.turn(position_mm)
+        return Pose(np.eye(3), position_mm * self.travel_stage)
+
+    def _travel(self, position_mm: float, laser_sensor_mm: Float64Array) -> Float64Array:
+        """Return the unit direction of travel in the part frame; of a turntable the tangent at the laser."""
+        if self.turntable is None:
+            return self.part_from_stage.rotate(self.travel_stage)
+        normal_stage = self.stage_from_sensor.rotate(np.array([0.0, 1.0, 0.0]))
+        tangent = self.turntable.tangent(self.stage_from_sensor.apply(laser_sensor_mm), normal_stage)
+        return (self.part_from_stage @ self.turntable.turn(position_mm)).rotate(tangent)
 
     def place(self, profile: Profile, position_mm: float | None = None) -> Scanline:
         """Return the profile in the part frame.
@@ -62,7 +113,7 @@ class Rig:
         points_mm = np.stack([profile.x_mm, np.zeros_like(profile.x_mm), profile.z_mm], axis=1)
         no_return = np.isnan(profile.x_mm) | np.isnan(profile.z_mm)
         points_mm[no_return] = np.nan
-        travel = self.part_from_stage.rotate(self.travel_stage)
+        travel = self._travel(float(at_mm), profile.laser_mm)
         normal = part_from_sensor.rotate(np.array([0.0, 1.0, 0.0]))
         return Scanline(
             device_id=profile.device_id,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from drivers.errors import PositionUnknown
-from drivers.rig import Rig
+from drivers.rig import Rig, Turntable
 from drivers.scanline import Pose, Profile
 
 ANGLES = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
@@ -86,3 +86,39 @@ def test_a_travel_that_is_no_unit_vector_is_refused() -> None:
     for wrong in (np.array([0.0, 2.0, 0.0]), np.zeros(3), np.array([0.0, 1.0]), np.full(3, np.nan)):
         with pytest.raises(ValueError, match="unit vector"):
             Rig(travel_stage=wrong)
+
+
+@given(ANGLES, LENGTHS, ANGLES, LENGTHS, st.floats(-4, 4), st.floats(1, 500))
+def test_a_turntable_turns_the_sensor_about_its_axis(
+    part_angles: tuple[float, ...],
+    part_shift: tuple[float, ...],
+    sensor_angles: tuple[float, ...],
+    sensor_shift: tuple[float, ...],
+    turns: float,
+    radius_mm: float,
+) -> None:
+    part_from_stage, stage_from_sensor = pose(part_angles, part_shift), pose(sensor_angles, sensor_shift)
+    axis = np.array([0.0, 0.6, 0.8])
+    rig = Rig(part_from_stage, stage_from_sensor, turntable=Turntable(axis, radius_mm))
+    position_mm = turns * 2 * math.pi * radius_mm
+    line = rig.place(profile(position_mm=position_mm))
+    turn = Rotation.from_rotvec(axis * turns * 2 * math.pi).as_matrix()
+    sensor_mm = np.array([-1.0, 0.0, 5.0])
+    in_stage = turn @ stage_from_sensor.apply(sensor_mm)
+    np.testing.assert_allclose(line.points_mm[0], part_from_stage.apply(in_stage), atol=1e-8)
+    laser_stage = turn @ stage_from_sensor.apply(np.array([0.0, 0.0, 100.0]))
+    np.testing.assert_allclose(line.laser_mm, part_from_stage.apply(laser_stage), atol=1e-8)
+    # The travel is where the laser goes: the derivative of its place.
+    ahead = rig.place(profile(position_mm=position_mm + 1e-4 * radius_mm))
+    gone = ahead.laser_mm - line.laser_mm
+    if np.linalg.norm(np.cross(axis, laser_stage)) > 1.0:
+        np.testing.assert_allclose(gone / np.linalg.norm(gone), line.travel, atol=2e-4)
+    assert float(line.plane_normal @ line.travel) >= 0
+
+
+def test_a_laser_on_the_axis_of_a_turntable_travels_along_its_plane_s_normal() -> None:
+    rig = Rig(turntable=Turntable(np.array([0.0, 0.0, 1.0]), 40.0))
+    np.testing.assert_allclose(rig.place(profile(position_mm=0.0)).travel, [0.0, 1.0, 0.0], atol=1e-12)
+    for radius_mm in (0.0, -1.0, math.nan):
+        with pytest.raises(ValueError, match="radius"):
+            Turntable(np.array([0.0, 0.0, 1.0]), radius_mm)
