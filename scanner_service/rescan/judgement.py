@@ -38,6 +38,7 @@ class Reason(IntEnum):
     LOST_LINES = 5
     NOISY = 6
     ISOLATED = 7
+    UNTOUCHED = 8  # said of regions of a reference surface only, never of a point
 
     @property
     def label(self) -> str:
@@ -54,6 +55,7 @@ REMEDIES = {
     Reason.LOST_LINES: "the same pass again",
     Reason.NOISY: "slower, other exposure or other direction",
     Reason.ISOLATED: "none: flagged",
+    Reason.UNTOUCHED: "a pass that sees it",
 }
 
 

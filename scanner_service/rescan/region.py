@@ -1,6 +1,7 @@
-"""One rescan region as it is told: where, how large, why, and how urgent; finds none."""
+"""One rescan region as it is told: where, how large, why, how urgent and how far it has come; finds none."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 
@@ -9,6 +10,40 @@ from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.stations import IntArray
 
 _HALF_PRIORITY_MM2 = 25.0
+
+
+class RegionStatus(StrEnum):
+    """How far a region has come.
+
+    `open`: found, and no pass has been over it since. `rescanned`: a later pass put points on it, and it fails still.
+    `resolved`: its surface meets the requirement. `unreachable`: no pose that the rig can take sees it.
+    """
+
+    OPEN = "open"
+    RESCANNED = "rescanned"
+    RESOLVED = "resolved"
+    UNREACHABLE = "unreachable"
+
+
+@dataclass(frozen=True, slots=True)
+class RegionMoment:
+    """What was said of a region at one version of the map: its status then, area, priority, and a sentence."""
+
+    version: int
+    status: RegionStatus
+    area_mm2: float
+    priority: float
+    why: str
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {
+            "version": self.version,
+            "status": self.status.value,
+            "area_mm2": self.area_mm2,
+            "priority": self.priority,
+            "why": self.why,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +57,11 @@ class RescanRegion:
     is 1 - measured / required, or 1 - limit / noise for noise, at least 1 - r / Δs' for steep surface, 1 out of range
     and 0 for isolated points. 0 is not worth a pass, near 1 is large and empty.
     `point_rows` (point_count,) are rows of the snapshot: the failing points, or a gap's ends.
+
+    `number` is the place in the list of one report; `region_id` names the region as long as the session lives (0: not
+    followed, a report by itself). `confidence` is the share of trust in the verdict, 0 to 1. `line_spacing_mm`
+    is the largest spacing on the surface that the requirement allows there, NaN if unknown. `history` are the changes
+    of its status, the oldest first.
     """
 
     number: int
@@ -37,6 +77,11 @@ class RescanRegion:
     point_count: int
     remedy: str
     point_rows: IntArray
+    confidence: float = 1.0
+    line_spacing_mm: float = float("nan")
+    region_id: int = 0
+    status: RegionStatus = RegionStatus.OPEN
+    history: tuple[RegionMoment, ...] = ()
 
     def __post_init__(self) -> None:
         for array in (*self.outline_mm, self.centroid_mm, self.normal, self.point_rows):
@@ -46,6 +91,8 @@ class RescanRegion:
         """For JSON: plain numbers and lists, None where a value is unknown, without the point rows."""
         return {
             "number": self.number,
+            "id": self.region_id or None,
+            "status": self.status.value,
             "reason": self.reason.label,
             "remedy": self.remedy,
             "area_mm2": self.area_mm2,
@@ -54,9 +101,12 @@ class RescanRegion:
             "measured_per_mm2": _known(self.measured_per_mm2),
             "required_per_mm2": _known(self.required_per_mm2),
             "counting_error_per_mm2": _known(self.counting_error_per_mm2),
+            "line_spacing_mm": _known(self.line_spacing_mm),
             "priority": self.priority,
+            "confidence": self.confidence,
             "point_count": self.point_count,
             "outline_mm": [loop.tolist() for loop in self.outline_mm],
+            "history": [moment.to_dict() for moment in self.history],
         }
 
 
