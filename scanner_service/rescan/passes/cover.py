@@ -124,6 +124,8 @@ class Cover:
             lane = np.abs(local[:, 0] - centre) <= 0.5 * width
             depth = _depth(local[lane, 2], gain[lane], 0.94 * (high - low)) - 0.5 * (low + high)
             lane &= (local[:, 2] - depth >= low) & (local[:, 2] - depth <= high)
+            if not lane.any():
+                continue
             motion = StraightMotion(
                 Pose(rotation.copy(), rotation @ np.array([centre - optics.middle_mm, 0.0, depth])),
                 rotation[:, 1].copy(),
@@ -131,7 +133,7 @@ class Cover:
             way = self._reach.seconds_between(standing, motion.part_from_sensor(float(local[lane, 1].mean())))
             stretch = best_stretch(
                 local[lane, 1], coarsest[lane], gain[lane], self._reach.line_spacing_mm, _ENDLESS,
-                self._reach.seconds, way,
+                self._reach.seconds_each, way,
             )  # fmt: skip
             if stretch is not None:
                 found.append(Candidate(attitude, motion, stretch.gain_per_s))
@@ -148,7 +150,7 @@ class Cover:
         way = self._reach.seconds_between(standing, motion.part_from_sensor(self._middle(prospect)), attitude.turn)
         stretch = best_stretch(
             prospect.position_mm, prospect.coarsest_mm, self.left_mm2, self._reach.line_spacing_mm,
-            _ENDLESS if is_free else self._travel, self._reach.seconds, way,
+            _ENDLESS if is_free else self._travel, self._reach.seconds_each, way,
         )  # fmt: skip
         if stretch is None:
             return None

@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit
 
 UNTOUCHED, FREE, HIDDEN, SURFACE = 0, 1, 2, 3
+CLEAR = 1.6
+"""Cells that a sight goes before anything is in its way: beside an inner edge the other wall begins that near."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -203,7 +205,7 @@ def clear_ways(state, low, cell, places, normals, directions, least_cosine, out)
                 lift = 1.5 * cell
                 x, y, z = (places[n, 0] + lift * normals[n, 0], places[n, 1] + lift * normals[n, 1],
                            places[n, 2] + lift * normals[n, 2])  # fmt: skip
-                out[n, d] = first_stop(state, low, cell, x, y, z, dx, dy, dz, 0.5 * cell, np.inf) == np.inf
+                out[n, d] = first_stop(state, low, cell, x, y, z, dx, dy, dz, CLEAR * cell, np.inf) == np.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -220,4 +222,4 @@ def clear_sights(state, low, cell, places, normals, targets, asked, out):
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         if length > 0:
             dx, dy, dz = dx / length, dy / length, dz / length
-            out[n] = first_stop(state, low, cell, x, y, z, dx, dy, dz, 0.5 * cell, length) == np.inf
+            out[n] = first_stop(state, low, cell, x, y, z, dx, dy, dz, CLEAR * cell, length) == np.inf

@@ -19,7 +19,7 @@ from scanner_service.rescan.passes.recommendation import Plan, Promise, Recommen
 from scanner_service.rescan.passes.visibility import OpenSky, look_around
 from scanner_service.rescan.regions import RegionReport
 
-MAX_NEEDS = 6_000
+MAX_NEEDS = 4_000
 """More places than this are thinned at random, each that is left standing for more area."""
 TRIES = 3
 """So often a place is promised before it is given up."""
@@ -53,7 +53,7 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Wishes:
-    """What is asked of a plan: the density wanted, how many passes, the least gain of one, and the search beyond regions.
+    """What is asked of a plan: the density wanted, how many passes, and the least gain of one.
 
     `explore` reckons with surface where hidden space begins, outside of any region. `chances` are how likely each kind
     of evidence has proved.
@@ -63,7 +63,7 @@ class Wishes:
     max_passes: int = 6
     least_gain_mm2: float = 2.0
     explore: bool = True
-    chances: tuple[float, float, float, float] = (1.0, 0.9, 0.75, 1.0)
+    chances: tuple[float, float, float, float] = (1.0, 1.0, 0.9, 1.0)
     cell_mm: float | None = None
 
 

@@ -1,4 +1,4 @@
-"""What a rig can do: the attitudes its sensor can take to the part, how fast, and within which limits; knows no needs."""
+"""What a rig can do: the attitudes of its sensor to the part, how fast, and within which limits; knows no needs."""
 
 import math
 from collections.abc import Iterator
@@ -131,8 +131,12 @@ class Reach:
 
     def seconds(self, length_mm: float, line_spacing_mm: float) -> float:
         """How long a pass takes, from its first line to its last."""
-        rate_hz = self.line_rate_hz(line_spacing_mm)
-        return (math.floor(length_mm / line_spacing_mm + 1e-9) + 1) / rate_hz
+        return float(self.seconds_each(np.array([length_mm]), line_spacing_mm)[0])
+
+    def seconds_each(self, length_mm: Float64Array, line_spacing_mm: float) -> Float64Array:
+        """How long passes of lengths (n,) take: (n,)."""
+        lines = np.floor(length_mm / line_spacing_mm + 1e-9) + 1.0
+        return np.asarray(lines / self.line_rate_hz(line_spacing_mm), dtype=np.float64)
 
     def line_rate_hz(self, line_spacing_mm: float) -> float:
         """The fastest rate at which lines of a spacing can be taken."""

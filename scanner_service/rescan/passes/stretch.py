@@ -40,7 +40,7 @@ def best_stretch(
     gain_mm2: Float64Array,
     spacing_mm: tuple[float, float],
     travel_mm: tuple[float, float],
-    seconds: Callable[[float, float], float],
+    seconds: Callable[[Float64Array, float], Float64Array],
     overhead_s: float,
 ) -> Stretch | None:
     """The stretch with the highest gain per second; None when there is no gain at all.
@@ -49,7 +49,7 @@ def best_stretch(
     ----------
     position_mm, coarsest_mm, gain_mm2 : (n,) where each place is met, the coarsest spacing that is enough, its worth.
     spacing_mm, travel_mm : what the rig can do.
-    seconds : time for a length and a spacing.
+    seconds : times (n,) of lengths (n,) at a spacing.
     overhead_s : time before the first line.
     """
     finest, coarsest = spacing_mm
@@ -67,7 +67,7 @@ def best_stretch(
         worth = total[None, :] - total[:, None]  # from bin i to bin j
         run_mm = max(RUN_MM, 2.0 * float(spacing))
         lengths = width * np.arange(BINS + 1) + 2.0 * run_mm
-        times = overhead_s + np.array([seconds(float(length), float(spacing)) for length in lengths])
+        times = overhead_s + seconds(lengths, float(spacing))
         first, last = np.indices(worth.shape)
         rate = np.where(last > first, worth / times[np.maximum(last - first, 0)], 0.0)
         i, j = np.unravel_index(int(rate.argmax()), rate.shape)
