@@ -1,11 +1,9 @@
 """The closed loop measured: coverage of the scannable surface for the time spent, against three other ways to scan."""
 
-import json
 import math
-import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +16,15 @@ from scanner_service.analysis.live_map import LiveMap, MapSettings
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.looks import look_of
 from scanner_service.rescan.passes.motion import StraightMotion
-from scanner_service.rescan.passes.outcome import Outcome, reckon
 from scanner_service.rescan.passes.optics import ScannerOptics
-from scanner_service.rescan.passes.planner import Plan, Tried, Wishes, plan_passes
+from scanner_service.rescan.passes.outcome import Outcome, reckon
+from scanner_service.rescan.passes.planner import Tried, Wishes, plan_passes
 from scanner_service.rescan.passes.reach import Reach
+from scanner_service.rescan.passes.recommendation import Plan
 from scanner_service.rescan.regions import RegionReport, find_regions
 from scanner_service.rescan.requirement import Requirement
 from simulators.meshes import load_mesh
-from simulators.optics import LaserLineScanner, demo_scanner
+from simulators.optics import LaserLineScanner
 from simulators.parts import PARTS, Part
 from simulators.posed_rig import PosedScanner
 from simulators.shapes import Surface
@@ -297,8 +296,10 @@ def closed_loop(
         scan.run.true_gain_mm2.append(scan.truth.met_mm2 - before)
         tell(
             f"  pass {len(scan.run.seconds)}: {scan.run.seconds[-1]:.1f} s, {scan.run.coverage[-1]:.2%}, promised "
-            f"{outcome.promised_mm2:.0f}, reached {outcome.reached_mm2:.0f}, truth {scan.run.true_gain_mm2[-1]:.0f} mm2, "
-            f"tilt {math.degrees(reach.tilt_rad(chosen.start_pose.rotation)):.0f}, spacing {chosen.line_spacing_mm:.3f}, "
+            f"{outcome.promised_mm2:.0f}, reached {outcome.reached_mm2:.0f}, truth {scan.run.true_gain_mm2[-1]:.0f}"
+            " mm2, "
+            f"tilt {math.degrees(reach.tilt_rad(chosen.start_pose.rotation)):.0f}, "
+            f"spacing {chosen.line_spacing_mm:.3f}, "
             f"needed {plan.needed_mm2:.0f}, planned in {scan.run.planning_s[-1]:.2f} s"
         )
     return scan.run, scan, plan

@@ -185,7 +185,9 @@ class CoverageTruth:
         for begin in range(0, len(self._places), 2000):
             part = slice(begin, begin + 2000)
             near = tree.query_ball_point(self._places[part], BALL_MM)
-            of = np.repeat(np.arange(begin, begin + len(near)), [len(one) for one in near])
+            of = np.repeat(
+                np.arange(begin, begin + len(near)), np.array([np.size(one) for one in near], dtype=np.int64)
+            )
             if not len(of):
                 continue
             which = np.concatenate([np.asarray(one, dtype=np.int64) for one in near])

@@ -12,6 +12,7 @@ from scanner_service.commands.bench import bench_app
 from scanner_service.commands.demo import demo_command
 from scanner_service.commands.open_viewer import open_command
 from scanner_service.commands.replay import replay_command
+from scanner_service.commands.rescan import rescan_command
 from scanner_service.commands.serve import DEFAULT_DATA, serve_command
 from scanner_service.commands.simulate import simulate_command
 
@@ -27,6 +28,7 @@ app.command("open")(open_command)
 app.command("demo")(demo_command)
 app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)
+app.command("rescan")(rescan_command)
 app.command("simulate")(simulate_command)
 app.add_typer(bench_app, name="bench")
 

@@ -15,11 +15,19 @@ from scanner_service.api.guard import Guard, GuardRules
 from scanner_service.api.login import login_router
 from scanner_service.api.origins import Allowlist
 from scanner_service.api.problems import Problem, ProblemTable, register_problems
-from scanner_service.api.routes import health, live, results, scanlines, sessions
+from scanner_service.api.routes import health, live, passes, results, scanlines, sessions
 from scanner_service.api.scopes import Scoped, check_every_route_declares_a_scope, public
 from scanner_service.api.service import Service
+from scanner_service.rescan.passes.errors import PassOutOfReach, PlanningError
 from scanner_service.rescan.requirement import RequirementUnusable
-from scanner_service.sessions.errors import LineRefused, SessionBusy, SessionError, SessionNotLive, SourceUnusable
+from scanner_service.sessions.errors import (
+    LineRefused,
+    PassUnknown,
+    SessionBusy,
+    SessionError,
+    SessionNotLive,
+    SourceUnusable,
+)
 from scanner_service.storage.errors import RecordBusy, RecordError, SessionUnknown
 from scanner_service.storage.exports.errors import ExportError
 from scanner_service.storage.formats.errors import FormatError
@@ -29,6 +37,9 @@ SESSION_PROBLEMS: ProblemTable = {
     SessionBusy: Problem(409, "session-busy", "The session is in another state"),
     SessionNotLive: Problem(409, "session-not-live", "The session is not open"),
     SessionError: Problem(409, "session-error", "The session cannot do that"),
+    PassUnknown: Problem(404, "pass-unknown", "There is no such pass"),
+    PassOutOfReach: Problem(422, "pass-out-of-reach", "The pass would leave the limits of the rig"),
+    PlanningError: Problem(409, "planning-impossible", "No pass can be planned"),
     SourceUnusable: Problem(422, "source-unusable", "The source cannot be read"),
     FormatError: Problem(422, "file-unusable", "The file cannot be read"),
     LineRefused: Problem(409, "line-refused", "The scanline was not taken"),
@@ -61,7 +72,7 @@ def make_app(service: Service, allowlist: Allowlist | None = None) -> ASGIApp:
     register_problems(app, problems)
     install_docs(app, problems.values())
     app.include_router(login_router())
-    for module in (health, sessions, scanlines, results, live):
+    for module in (health, sessions, scanlines, results, passes, live):
         app.include_router(module.router)
 
     @app.get("/", dependencies=[Depends(public)], include_in_schema=False)

@@ -15,11 +15,13 @@ Vector = tuple[Finite, Finite, Finite]
 MAX_PLACES = 100_000
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
+    """A body in which every field is known, and nothing changes."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class DeviceSourceIn(_Strict):
+class DeviceSourceIn(Strict):
     """One pass of a scanner that speaks the native protocol."""
 
     kind: Literal["device"]
@@ -31,7 +33,7 @@ class DeviceSourceIn(_Strict):
     line_rate_hz: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] = 50.0
 
 
-class ReplaySourceIn(_Strict):
+class ReplaySourceIn(Strict):
     """A recorded scan that lies in the service's replay folder; `file` is its bare name."""
 
     kind: Literal["replay"]
@@ -42,13 +44,13 @@ class ReplaySourceIn(_Strict):
     laser_mm: Vector | None = None
 
 
-class PushSourceIn(_Strict):
+class PushSourceIn(Strict):
     """Scanlines that the client pushes."""
 
     kind: Literal["push"]
 
 
-class SettingsIn(_Strict):
+class SettingsIn(Strict):
     """Radius, reliability and requirement; everything may be left out."""
 
     radius_rule: LiveRule = "line"
@@ -65,7 +67,7 @@ class SettingsIn(_Strict):
         return SessionSettings(max_normal_error_rad=math.radians(values.pop("max_normal_error_deg")), **values)
 
 
-class SessionIn(_Strict):
+class SessionIn(Strict):
     """A session to be made."""
 
     name: Annotated[str, Field(min_length=1, max_length=200)] = "scan"
@@ -74,7 +76,7 @@ class SessionIn(_Strict):
     origin_mm: Vector = (0.0, 0.0, 0.0)
 
 
-class ScanlineIn(_Strict):
+class ScanlineIn(Strict):
     """One scanline in the part frame; a point without a return is null.
 
     A line is known by device, boot and index: pushed again it is answered as `duplicate` and not stored twice.
@@ -121,7 +123,7 @@ class ScanlineIn(_Strict):
         )
 
 
-class PassIn(_Strict):
+class PassIn(Strict):
     """What names a pass within a session."""
 
     device_id: Annotated[str, Field(min_length=1, max_length=200)]
@@ -129,7 +131,7 @@ class PassIn(_Strict):
     pass_index: Annotated[int, Field(ge=0, lt=2**31)]
 
 
-class ScanlinesIn(_Strict):
+class ScanlinesIn(Strict):
     """Scanlines, in the order in which they were taken."""
 
     lines: Annotated[list[ScanlineIn], Field(min_length=1, max_length=256)]

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Sequence
 
 from scanner_service.sessions.errors import SessionBusy
+from scanner_service.sessions.pass_desk import PassDesk
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec, SourceSpec
@@ -24,6 +25,7 @@ class SessionBook:
     def __init__(self, record: Record) -> None:
         self.record = record
         self._live: dict[str, LiveSession] = {}
+        self._desks: dict[str, tuple[LiveSession, PassDesk]] = {}
         self._lock = threading.RLock()
         for row in self._all_rows():
             if row.state in ("scanning", "paused"):  # the service ended in the middle of it
@@ -84,6 +86,14 @@ class SessionBook:
             source: Source = PushSource() if row.source.get("kind") == PushSpec().to_dict()["kind"] else SpentSource()
             return self._hold(LiveSession(row, self.record, source), on_progress)
 
+    def pass_desk(self, session: LiveSession) -> PassDesk:
+        """The desk where the session's recommended passes are ordered; made when it is first asked for."""
+        with self._lock:
+            known = self._desks.get(session.row.session_id)
+            if known is None or known[0] is not session:
+                known = self._desks[session.row.session_id] = (session, PassDesk(session))
+            return known[1]
+
     def live(self, session_id: str) -> LiveSession | None:
         """The session if it is held open."""
         return self._live.get(session_id)
@@ -100,6 +110,7 @@ class SessionBook:
         """Stop and delete a session with everything stored of it; raises SessionUnknown."""
         with self._lock:
             live = self._live.pop(session_id, None)
+            self._desks.pop(session_id, None)
             if live is not None:
                 live.close()
             self.record.delete_session(session_id)
@@ -124,6 +135,7 @@ class SessionBook:
             if session.state in ("stopped", "failed", "interrupted"):
                 session.close()
                 del self._live[session_id]
+                self._desks.pop(session_id, None)
                 return
         raise SessionBusy(f"{MAX_LIVE} sessions are scanning or waiting: stop one first")
 

@@ -300,7 +300,9 @@ class PassDesk:
             return
         known = dict(self._session.row.source)
         if known.pop("kind", None) != "device" or not isinstance(wanted.motion, StraightMotion):
-            raise SessionBusy("this session's source cannot be driven: scan the pass by hand into a session of pushed lines")
+            raise SessionBusy(
+                "this session's source cannot be driven: scan the pass by hand into a session of pushed lines"
+            )
         spec = dataclasses.replace(
             DeviceSpec(**known),
             line_spacing_mm=wanted.line_spacing_mm,
@@ -321,7 +323,9 @@ class PassDesk:
                 fresh = set(after.snapshot.lines.pass_number.tolist()) - set(before.snapshot.lines.pass_number.tolist())
                 planned = order.planned
                 if isinstance(planned.motion, StraightMotion):
-                    self._driven += [(number, planned.motion, planned.start_mm, planned.end_mm) for number in sorted(fresh)]
+                    self._driven += [
+                        (number, planned.motion, planned.start_mm, planned.end_mm) for number in sorted(fresh)
+                    ]
                 self._tried = self._tried.and_also(outcome.missed_mm)
                 self._standing = planned.end_pose
                 self._plan = None

@@ -146,8 +146,10 @@ class LiveSession:
                 raise SessionBusy(f"the session is {self._state}: a further pass can be scanned once it is stopped")
             known = self.source
             source = open_source()
-            if source.towards_sensor is None or known.towards_sensor is None or not np.allclose(
-                source.towards_sensor, known.towards_sensor
+            if (
+                source.towards_sensor is None
+                or known.towards_sensor is None
+                or not np.allclose(source.towards_sensor, known.towards_sensor)
             ):
                 source.towards_sensor = None  # the passes look from several sides: each is judged by its own rays
             self.source, self._state = source, "scanning"

@@ -73,8 +73,7 @@ class Cover:
         for attitude in self._reach.near(best.attitude):
             seen = self._roughly_seen(attitude)
             for candidate in self._rough(attitude, seen, standing)[:1]:
-                best = self._better(best, self._exact(attitude, candidate.motion, standing))
-        assert best is not None
+                best = self._better(best, self._exact(attitude, candidate.motion, standing)) or best
         self.left_mm2[best.served] = 0.0
         return best
 
@@ -172,7 +171,7 @@ def _lanes(x_mm: Float64Array, gain: Float64Array, width_mm: float) -> list[floa
     if high - low <= width_mm:
         return [0.5 * (low + high)]
     count = math.ceil((high - low - width_mm) / (0.5 * width_mm)) + 1
-    return np.linspace(low + 0.5 * width_mm, high - 0.5 * width_mm, count).tolist()
+    return [float(x) for x in np.linspace(low + 0.5 * width_mm, high - 0.5 * width_mm, count)]
 
 
 def _depth(z_mm: Float64Array, gain: Float64Array, span_mm: float) -> float:

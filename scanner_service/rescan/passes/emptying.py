@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 from numba import njit
 
 from scanner_service.rescan.passes.marching import FREE, HIDDEN, SURFACE
@@ -25,9 +24,9 @@ def _way_out(state, low, cell, x, y, z, tx, ty, tz):
     steps_out = 0
     share = 0.0
     while share < 1.0:
-        i = int(math.floor((x + share * dx - low[0]) / cell))
-        j = int(math.floor((y + share * dy - low[1]) / cell))
-        k = int(math.floor((z + share * dz - low[2]) / cell))
+        i = math.floor((x + share * dx - low[0]) / cell)
+        j = math.floor((y + share * dy - low[1]) / cell)
+        k = math.floor((z + share * dz - low[2]) / cell)
         if i < 0 or j < 0 or k < 0 or i >= ni or j >= nj or k >= nk:
             return True, li, lj, lk
         here = state[i, j, k]

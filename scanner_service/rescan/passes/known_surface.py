@@ -87,7 +87,7 @@ def know_surface(
     margin = _MARGIN_MM
     side = _cell_side(snapshot, low - margin, high + margin) if cell_mm is None else cell_mm
     low = low - margin
-    shape = tuple(int(math.ceil(float(extent) / side)) + 1 for extent in high + margin - low)
+    shape = tuple(math.ceil(float(extent) / side) + 1 for extent in high + margin - low)
     index = np.full(shape, -1, dtype=np.int32)
     sums = np.zeros((min(int(use.sum()), int(np.prod(shape))), 9))
     bits = np.zeros(len(sums), dtype=np.uint64)
@@ -142,7 +142,8 @@ def _cell_side(snapshot: MapSnapshot, low: Float64Array, high: Float64Array) -> 
         float(np.median(spacing)) if len(spacing) else 0.0, float(np.nanmedian(along)) if len(along) else 0.0
     )
     by_lines = max(LEAST_CELL_MM, _LINES_IN_A_CELL * coarsest)
-    return max(by_lines, float(np.prod(high - low) / MAX_CELLS) ** (1.0 / 3.0))
+    volume_mm3 = float(np.prod(high - low))
+    return max(by_lines, float((volume_mm3 / MAX_CELLS) ** (1.0 / 3.0)))
 
 
 def _normals(

@@ -14,7 +14,7 @@ CLEAR = 1.6
 def first_stop(state, low, cell, x, y, z, dx, dy, dz, start, end):
     """Distance along a ray at which it enters a cell that is HIDDEN or SURFACE; inf when none does before `end`."""
     x, y, z = (x + start * dx - low[0]) / cell, (y + start * dy - low[1]) / cell, (z + start * dz - low[2]) / cell
-    i, j, k = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+    i, j, k = math.floor(x), math.floor(y), math.floor(z)
     si, sj, sk = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
     ti = cell / abs(dx) if dx != 0 else np.inf
     tj = cell / abs(dy) if dy != 0 else np.inf
@@ -42,7 +42,7 @@ def first_stop(state, low, cell, x, y, z, dx, dy, dz, start, end):
 def _mark(state, low, cell, x, y, z, dx, dy, dz, start, end, mark):
     """Write `mark` into the cells on a ray: FREE wherever no surface is, HIDDEN only where nothing is known."""
     x, y, z = (x + start * dx - low[0]) / cell, (y + start * dy - low[1]) / cell, (z + start * dz - low[2]) / cell
-    i, j, k = int(math.floor(x)), int(math.floor(y)), int(math.floor(z))
+    i, j, k = math.floor(x), math.floor(y), math.floor(z)
     si, sj, sk = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
     ti = cell / abs(dx) if dx != 0 else np.inf
     tj = cell / abs(dy) if dy != 0 else np.inf
@@ -71,8 +71,8 @@ def gather(points, use, line, pass_number, normals, fails, region, low, cell, in
     """Add up the points of each cell.
 
     `index` (the grid's shape) numbers the cells in the order in which they are met, -1 = none; `sums` (cells, 9) are
-    x, y, z, normal's x, y, z, points, failing points, the number of a region (0: none). `first` (n,) is True for the first
-    point that a pass has in a cell; `pass_bits` (cells,) remembers which passes had one. Returns the number of cells.
+    x, y, z, normal's x, y, z, points, failing points, the number of a region (0: none). `first` (n,) is True for the
+    first point that a pass has in a cell; `pass_bits` (cells,) remembers the passes. Returns the number of cells.
     """
     count = 0
     for row in range(len(points)):

@@ -46,7 +46,8 @@ class StraightMotion:
         along = self.travel @ rotation
         if abs(along[1]) < 1e-9:  # the plane would slide within itself
             never = np.full(len(places_mm), np.nan)
-            return Sights(never, local, *(np.full_like(places_mm, np.nan) for _ in range(2)), never)
+            nowhere = np.full_like(places_mm, np.nan)
+            return Sights(never, local, nowhere, nowhere, never)
         position = local[:, 1] / along[1]
         shift = position[:, None] * self.travel
         laser = self.at_zero.apply(optics.geometry.laser_mm) + shift
@@ -112,7 +113,8 @@ class TurningMotion:
                         )
                     )
                 )
-        assert best is not None
+        if best is None:
+            raise AssertionError("two ways were tried")
         return best
 
     def _at(

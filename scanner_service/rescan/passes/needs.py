@@ -1,4 +1,4 @@
-"""What is still wanted of a surface: places whose scanning would be a gain, each with what it belongs to; knows no rig."""
+"""What is still wanted of a surface: places whose scanning would be a gain, and what each belongs to; knows no rig."""
 
 from dataclasses import dataclass
 from enum import IntEnum

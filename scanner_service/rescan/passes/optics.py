@@ -1,4 +1,4 @@
-"""What a laser-line scanner can see from where it stands: fan, range, incidence and density; knows no part and no rig."""
+"""What a laser-line scanner sees from where it stands: fan, range, incidence, ray spacing; knows no part and no rig."""
 
 import math
 from dataclasses import dataclass

@@ -9,8 +9,7 @@ from scipy.spatial import cKDTree
 from drivers.scanline import BoolArray, Float64Array, Pose, read_only
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.cover import Choice, Cover
-from scanner_service.rescan.passes.gain import MARGIN
-from scanner_service.rescan.passes.known_surface import KnownSurface, know_surface
+from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.looks import Look
 from scanner_service.rescan.passes.needs import Evidence, Needs, failing_points, find_needs
 from scanner_service.rescan.passes.optics import ScannerOptics

@@ -61,12 +61,12 @@ def best_stretch(
     width = max((high - low) / BINS, 1e-6)
     bin_of = np.minimum(((at - low) / width).astype(np.int64), BINS - 1)
     best: Stretch | None = None
-    for spacing in np.unique(np.quantile(limit, np.linspace(0.0, 0.85, SPACINGS))):
+    for spacing in np.unique(np.quantile(limit, np.linspace(0.0, 0.85, SPACINGS))).tolist():
         fine = limit >= spacing
         total = np.concatenate([[0.0], np.cumsum(np.bincount(bin_of[fine], gain[fine], BINS))])
         worth = total[None, :] - total[:, None]  # from bin i to bin j
         run_mm = max(RUN_MM, 2.0 * float(spacing))
-        lengths = width * np.arange(BINS + 1) + 2.0 * run_mm
+        lengths = np.asarray(width * np.arange(BINS + 1) + 2.0 * run_mm, dtype=np.float64)
         times = overhead_s + seconds(lengths, float(spacing))
         first, last = np.indices(worth.shape)
         rate = np.where(last > first, worth / times[np.maximum(last - first, 0)], 0.0)
