@@ -114,7 +114,10 @@ def _tell_plan(plan: dict[str, Any]) -> None:
     table.add_column("serves")
     table.add_column("first")
     for one in plan["passes"]:
-        serves = ", ".join("unseen" if item["region"] is None else f"region {item['region']}" for item in one["serves"])
+        named = [str(item["region"]) for item in one["serves"] if item["region"] is not None]
+        more = f" and {len(named) - 3} more" if len(named) > 3 else ""
+        unseen = "unseen surface" if len(named) < len(one["serves"]) else ""
+        serves = ", ".join(filter(None, (f"regions {', '.join(named[:3])}{more}" if named else "", unseen)))
         table.add_row(
             str(one["number"]), f"{one['start_mm']:.1f}", f"{one['end_mm']:.1f}", f"{one['line_spacing_mm']:.3f}",
             str(one["lines"]), f"{one['duration_s'] + one['approach_s']:.1f}", f"{one['gain_mm2']:.0f}",

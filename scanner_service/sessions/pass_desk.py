@@ -6,14 +6,13 @@ Knows the session and the planner, no HTTP. Every step is an event of the sessio
 import dataclasses
 import logging
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
-from drivers.errors import DriverError
+from drivers.errors import DriverError, PortBusy, ScannerSilent
 from drivers.rig import Rig
 from drivers.rig_limits import AxisKind, RigLimits
 from drivers.scanline import Pose
@@ -31,7 +30,7 @@ from scanner_service.sessions.errors import PassUnknown, SessionBusy, SessionErr
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.source_specs import DeviceSpec
-from scanner_service.sessions.sources import DeviceSource, PushSource
+from scanner_service.sessions.sources import DeviceSource, PushSource, Source
 
 _LOG = logging.getLogger(__name__)
 _DRIVING = StraightMotion(Pose.identity(), np.array([0.0, 1.0, 0.0]))  # the default rig: part = (x, position, z)
@@ -311,7 +310,7 @@ class PassDesk:
             line_rate_hz=wanted.line_rate_hz,
         )
         rig = Rig(stage_from_sensor=wanted.motion.at_zero, travel_stage=wanted.motion.travel.copy())
-        self._session.carry_out(lambda: spec.open(rig))
+        self._session.carry_out(lambda: _open_patiently(spec, rig))
 
     def _follow(self, order: PassOrder, before: Results) -> None:
         """The thread of one pass: wait for its end, then say what it brought."""
@@ -373,7 +372,11 @@ class PassDesk:
         if loop.seconds + seconds > loop.limits.max_seconds:
             return f"the limit of {loop.limits.max_seconds:g} s is met"
         order = self.accept(best.number)
-        self.carry_out(order.order_id)
+        try:
+            self.carry_out(order.order_id)
+        except (SessionError, DriverError, PlanningError) as error:
+            order.status, order.message = PassStatus.FAILED, str(error)
+            raise
         loop.passes, loop.seconds = loop.passes + 1, loop.seconds + seconds
         self._wait_for(order)
         return order.message if order.status is PassStatus.FAILED else None
@@ -382,6 +385,16 @@ class PassDesk:
         done = threading.Event()
         while order.status is PassStatus.RUNNING:
             done.wait(poll_s)
+
+
+def _open_patiently(spec: DeviceSpec, rig: Rig, tries: int = 3) -> Source:
+    """Open the device's port again; what the pass before left on the wire may spoil the first greeting."""
+    for _ in range(tries - 1):
+        try:
+            return spec.open(rig)
+        except (ScannerSilent, PortBusy) as error:
+            _LOG.info("the scanner did not answer at once: %s", error)
+    return spec.open(rig)
 
 
 def optics_stated(
@@ -393,4 +406,3 @@ def optics_stated(
     return ScannerOptics(geometry, field_of_view_mm, rays, middle_mm, max_incidence_rad)
 
 
-Desk = Callable[[LiveSession], PassDesk]
