@@ -1,6 +1,7 @@
 """The closed loop measured: coverage of the scannable surface for the time spent, against three other ways to scan."""
 
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ from scanner_service.rescan.passes.recommendation import Plan
 from scanner_service.rescan.regions import RegionReport, find_regions
 from scanner_service.rescan.requirement import Requirement
 from simulators.meshes import load_mesh
-from simulators.optics import LaserLineScanner
+from simulators.optics import LaserLineScanner, demo_scanner
 from simulators.parts import PARTS, Part
 from simulators.posed_rig import PosedScanner
 from simulators.shapes import Surface
@@ -198,7 +199,8 @@ def uniform_raster(subject: Subject, reach: Reach, scanner: LaserLineScanner, sp
     scan.run.way = f"raster {spacing_mm:g} mm"
     order = [(0.0, 0.0, 0.0)]
     for tilt, offset, roll in ((45.0, 0.0, 0.0), (45.0, 45.0, 0.0), (65.0, 0.0, 0.0), (65.0, 45.0, 0.0),
-                               (45.0, 0.0, 90.0), (65.0, 0.0, 90.0), (30.0, 22.5, 180.0), (65.0, 22.5, 180.0)):  # fmt: skip
+                               (45.0, 0.0, 90.0), (65.0, 0.0, 90.0),
+                               (30.0, 22.5, 180.0), (65.0, 22.5, 180.0)):  # fmt: skip
         order += [(tilt, offset + 90.0 * k, roll) for k in range(4)]
     for tilt, azimuth, roll in order:
         for pose_at, start, end in raster_lanes(subject, scanner, attitude(tilt, azimuth, roll)):
@@ -303,3 +305,79 @@ def closed_loop(
             f"needed {plan.needed_mm2:.0f}, planned in {scan.run.planning_s[-1]:.2f} s"
         )
     return scan.run, scan, plan
+
+
+def promise_errors(run: Run) -> Float64Array:
+    """|reached - promised| / promised of each pass, by the service's own reckoning."""
+    promised = np.array(run.promised_mm2)
+    return np.abs(np.array(run.reached_mm2) - promised) / promised
+
+
+def measure(name: str, meshes: Path | None, folder: Path, tell: Callable[[str], None]) -> dict[str, object]:
+    """All ways over one part; writes the curves as JSON and as a picture."""
+    scanner = demo_scanner()
+    reach = reach_of(scanner)
+    subject = subject_of(name, scanner, reach.max_tilt_rad, meshes)
+    tell(f"{name}: {subject.truth().scannable_mm2:.0f} mm2 can be scanned")
+    loop, _, plan = closed_loop(subject, reach, scanner, tell)
+    runs = [loop]
+    for spacing in RASTER_SPACINGS_MM:
+        runs.append(uniform_raster(subject, reach, scanner, spacing))
+        tell(f"  {runs[-1].way}: {runs[-1].coverage[-1]:.2%} after {runs[-1].seconds[-1]:.1f} s")
+    runs += [at_random(subject, reach, scanner), largest_hole_first(subject, reach, scanner)]
+    rasters = [run for run in runs if run.way.startswith("raster")]
+    best_share = loop.coverage[-1]
+    found = {
+        "part": name,
+        "scannable_mm2": subject.truth().scannable_mm2,
+        "coverage": best_share,
+        "passes": len(loop.seconds),
+        "seconds": loop.seconds[-1],
+        "seconds_to_99": loop.seconds_to(GOAL),
+        "raster_seconds_to_99": min(run.seconds_to(GOAL) for run in rasters),
+        "raster_seconds_to_same": min(run.seconds_to(best_share) for run in rasters),
+        "median_promise_error": float(np.median(promise_errors(loop))) if loop.promised_mm2 else math.nan,
+        "median_planning_s": float(np.median(loop.planning_s)),
+        "unreachable_mm2": sum(one.area_mm2 for one in plan.unreachable) if plan else math.nan,
+        "runs": [asdict(run) for run in runs],
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"rescan-loop-{name}.json").write_text(json.dumps(found, indent=1, default=str))
+    draw_curves(runs, name, folder / f"rescan-loop-{name}.png")
+    return found
+
+
+def draw_curves(runs: list[Run], name: str, path: Path) -> None:
+    """Coverage of the scannable surface over the time of scanning, one curve a way."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(8.0, 4.5), layout="constrained")
+    greys = iter(("0.35", "0.45", "0.55", "0.65", "0.75"))
+    for run in runs:
+        is_loop, is_raster = run.way == "closed loop", run.way.startswith("raster")
+        colour = "tab:blue" if is_loop else next(greys) if is_raster else None
+        axes.step(
+            [0.0, *run.seconds], [0.0, *(100.0 * share for share in run.coverage)], where="post", label=run.way,
+            color=colour, linewidth=2.5 if is_loop else 1.2, linestyle="-" if is_loop or is_raster else "--",
+        )  # fmt: skip
+    axes.axhline(100.0 * GOAL, color="tab:red", linewidth=0.8)
+    axes.set_xlabel("time of scanning, the ways between passes included, s")
+    axes.set_ylabel("scannable surface that meets the density, %")
+    axes.set_title(f"{name}: {DENSITY_PER_MM2:g} points/mm² wanted")
+    axes.set_ylim(0.0, 101.0)
+    axes.legend(loc="lower right", fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main(arguments: list[str]) -> None:
+    """`python -m benchmarks.rescan_loop PART [MESH FOLDER] [OUT]`: one part by name, or a mesh of a folder."""
+    name = arguments[0] if arguments else "demo"
+    meshes = Path(arguments[1]) if len(arguments) > 1 else None
+    folder = Path(arguments[2]) if len(arguments) > 2 else Path("out")
+    found = measure(name, meshes, folder, lambda text: print(text, flush=True))
+    print({key: value for key, value in found.items() if key != "runs"})
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

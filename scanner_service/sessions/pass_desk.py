@@ -404,5 +404,3 @@ def optics_stated(
     if not 0 < max_incidence_rad < 0.5 * np.pi:
         raise OpticsUnknown("the largest incidence must lie between 0° and 90°")
     return ScannerOptics(geometry, field_of_view_mm, rays, middle_mm, max_incidence_rad)
-
-

@@ -17,8 +17,8 @@ class Guidance:
     """Where the hand is beside a pass; NaN: not known.
 
     `along_mm` is what is still to go along the pass (more than its length before the start), `aside_mm` how far the
-    laser is from the line it should follow, `angle_rad` between the laser plane and the wanted one, `speed_mm_per_s` now,
-    `wanted_mm_per_s` at most; `say` is one sentence.
+    laser is from the line it should follow, `angle_rad` between the laser plane and the wanted one,
+    `speed_mm_per_s` now, `wanted_mm_per_s` at most; `say` is one sentence.
     """
 
     along_mm: float
