@@ -56,7 +56,7 @@ def motion_of(world_from_scan: Pose) -> StraightMotion:
 
 
 def compare(folder: Path, max_incidence_rad: float = np.radians(65.0)) -> dict[str, dict[str, float]]:
-    """For each other scan: how much of the surface predicted visible it covers, and how many points it has elsewhere."""
+    """For each other scan: how much of what is predicted visible it covers, and which points it has elsewhere."""
     poses = poses_of(folder / "bun.conf")
     recording = open_recording(folder / "bun000.ply", ReadOptions(units="m"))
     live_map = LiveMap(MapSettings(noise_mm=0.1))

@@ -1,10 +1,11 @@
 """The closed loop measured: coverage of the scannable surface for the time spent, against three other ways to scan."""
 
+import json
 import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
