@@ -82,7 +82,8 @@ def compare(folder: Path, max_incidence_rad: float = np.radians(65.0)) -> dict[s
         prospect = prospect_of(surface, places, motion_of(poses[name]), optics)
         visible = prospect.coarsest_mm > 0
         covered = np.isfinite(cKDTree(points).query(surface.points_mm, distance_upper_bound=NEAR_MM)[0])
-        near, which = cKDTree(surface.points_mm).query(points, distance_upper_bound=NEAR_MM)
+        near, found_at = cKDTree(surface.points_mm).query(points, distance_upper_bound=NEAR_MM)
+        which = np.asarray(found_at, dtype=np.int64)
         on_known = np.isfinite(near)
         area = surface.area_mm2
         found[name] = {

@@ -19,7 +19,7 @@ from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.looks import look_of
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.optics import ScannerOptics
-from scanner_service.rescan.passes.outcome import Outcome, reckon
+from scanner_service.rescan.passes.outcome import Outcome, reckon, trust_of
 from scanner_service.rescan.passes.planner import Tried, Wishes, plan_passes
 from scanner_service.rescan.passes.reach import Reach
 from scanner_service.rescan.passes.recommendation import Plan
@@ -275,11 +275,12 @@ def closed_loop(
     scan.run.way = "closed loop"
     first_pass(scan, subject, scanner)
     optics = ScannerOptics(scanner.geometry(), scanner.field_of_view_mm, scanner.points_per_line)
-    wishes = Wishes(DENSITY_PER_MM2, max_passes=1)
+    earlier: list[tuple[float, float, float]] = []
     tried = Tried.nothing()
     snapshot, report = judged(scan, scanner)
     plan: Plan | None = None
     for _ in range(MAX_PASSES):
+        wishes = Wishes(DENSITY_PER_MM2, max_passes=1, trust=trust_of(earlier))
         begun = time.perf_counter()
         looks = [look_of(snapshot, n, *one, scanner.points_per_line) for n, one in enumerate(scan.looks)]
         seen = tuple(look for look in looks if look is not None)
@@ -294,6 +295,7 @@ def closed_loop(
         snapshot, report = judged(scan, scanner)
         outcome: Outcome = reckon(chosen, was, was_report, snapshot, report, wishes.cell_mm)
         tried = tried.and_also(outcome.missed_mm)
+        earlier.append((outcome.promised_mm2, outcome.reached_mm2, wishes.trust))
         scan.run.promised_mm2.append(outcome.promised_mm2)
         scan.run.reached_mm2.append(outcome.reached_mm2)
         scan.run.true_gain_mm2.append(scan.truth.met_mm2 - before)
@@ -311,7 +313,7 @@ def closed_loop(
 def promise_errors(run: Run) -> Float64Array:
     """|reached - promised| / promised of each pass, by the service's own reckoning."""
     promised = np.array(run.promised_mm2)
-    return np.abs(np.array(run.reached_mm2) - promised) / promised
+    return np.asarray(np.abs(np.array(run.reached_mm2) - promised) / promised, dtype=np.float64)
 
 
 def measure(name: str, meshes: Path | None, folder: Path, tell: Callable[[str], None]) -> dict[str, object]:

@@ -22,7 +22,7 @@ from scanner_service.rescan.passes.guidance import Guidance, guide
 from scanner_service.rescan.passes.looks import Look, look_of
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.optics import ScannerOptics
-from scanner_service.rescan.passes.outcome import Outcome, reckon
+from scanner_service.rescan.passes.outcome import Outcome, reckon, trust_of
 from scanner_service.rescan.passes.planner import Tried, Wishes, plan_passes
 from scanner_service.rescan.passes.reach import Reach
 from scanner_service.rescan.passes.recommendation import Plan, RecommendedPass
@@ -282,11 +282,16 @@ class PassDesk:
             results.report,
             setup.reach,
             setup.optics,
-            Wishes(required),
+            Wishes(required, trust=self._trust()),
             self._standing,
             self._tried,
             self._looks(results, setup.optics),
         )
+
+    def _trust(self) -> float:
+        """How much of what this session's passes promised was reached."""
+        done = [(one.outcome, one.planned.trust) for one in self._orders if one.status is PassStatus.DONE]
+        return trust_of([(out.promised_mm2, out.reached_mm2, trust) for out, trust in done if out is not None])
 
     def _looks(self, results: Results, optics: ScannerOptics) -> tuple[Look, ...]:
         found = [look_of(results.snapshot, *one, optics.rays) for one in self._driven]

@@ -157,7 +157,8 @@ class Cover:
             self._reach.check(motion, stretch.start_mm, stretch.end_mm, stretch.line_spacing_mm)
         except PassOutOfReach:
             return None
-        served = stretch.serves(prospect.position_mm, prospect.coarsest_mm) & (self.left_mm2 > 0)
+        # the margin is for choosing; what reaches the density without it is a gain as well
+        served = stretch.serves(prospect.position_mm, MARGIN * prospect.coarsest_mm) & (self.left_mm2 > 0)
         return Choice(attitude, motion, stretch, prospect, served)
 
     def _middle(self, prospect: Prospect) -> float:

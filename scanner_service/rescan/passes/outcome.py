@@ -1,5 +1,6 @@
 """What a pass promised against what it brought, region by region; plans nothing."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,9 @@ from scanner_service.rescan.passes.needs import UNSEEN, failing_points
 from scanner_service.rescan.passes.recommendation import RecommendedPass
 from scanner_service.rescan.regions import RegionReport
 
+_RECENT = 3
+_TRUST = (0.5, 1.6)
+_LEAST_MM2 = 20.0  # smaller promises say little
 _SAME = 0.75  # cells: surface this near to surface that was good before is not new
 _BESIDE = 4.0  # cells: new good surface this far from every place served belongs to no region
 
@@ -93,6 +97,23 @@ def reckon(
         regions.append(RegionOutcome(int(region), promised, float(new_mm2[fresh & (owner == region)].sum())))
     regions.sort(key=lambda one: -one.promised_mm2)
     return Outcome(tuple(regions), done.places_mm[missed])
+
+
+def trust_of(earlier: Sequence[tuple[float, float, float]]) -> float:
+    """How much of what passes promise is reached: by how much the next promises are multiplied.
+
+    Parameters
+    ----------
+    earlier : the area promised and reached by each earlier pass, and the trust that was in its promise.
+
+    Notes
+    -----
+    The median of the last few, so that one pass in vain does not spoil it, within bounds.
+    """
+    ratios = [reached * trust / promised for promised, reached, trust in earlier if promised > _LEAST_MM2]
+    if not ratios:
+        return 1.0
+    return float(np.clip(np.median(ratios[-_RECENT:]), *_TRUST))
 
 
 def _good(surface: KnownSurface) -> tuple[Float64Array, Float64Array]:

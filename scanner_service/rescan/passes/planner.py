@@ -55,7 +55,7 @@ class Wishes:
     """What is asked of a plan: the density wanted, how many passes, and the least gain of one.
 
     `explore` reckons with surface where hidden space begins, outside of any region. `chances` are how likely each kind
-    of evidence has proved.
+    of evidence has proved, `trust` is how much of what earlier passes promised was reached (`outcome.trust_of`).
     """
 
     density_per_mm2: float
@@ -64,6 +64,7 @@ class Wishes:
     explore: bool = True
     chances: tuple[float, float, float, float] = (1.0, 1.0, 0.9, 1.0)
     cell_mm: float | None = None
+    trust: float = 1.0
 
 
 def plan_passes(
@@ -88,7 +89,7 @@ def plan_passes(
     """
     fails, region = failing_points(report)
     surface = know_surface(snapshot, fails, region, wishes.cell_mm, looks, optics)
-    chances = dict(zip(Evidence, wishes.chances, strict=True))
+    chances = {kind: wishes.trust * chance for kind, chance in zip(Evidence, wishes.chances, strict=True)}
     needs = find_needs(snapshot, report, surface, wishes.density_per_mm2, chances, wishes.explore)
     needs, given_up = _without_vain(needs, tried or Tried.nothing(), surface.cell_mm)
     needs = _thinned(needs)
@@ -99,7 +100,7 @@ def plan_passes(
         choice = cover.next(standing)
         if choice is None or choice.stretch.gain_mm2 < wishes.least_gain_mm2:
             break
-        one = _recommend(len(passes) + 1, choice, needs, reach, standing)
+        one = _recommend(len(passes) + 1, choice, needs, reach, standing, wishes.trust)
         passes.append(one)
         standing = one.end_pose
     unreachable = _unreachable(needs, cover, sky, optics, reach) + _vain(given_up, needs)
@@ -129,7 +130,9 @@ def _thinned(needs: Needs) -> Needs:
     return Needs(**fields)
 
 
-def _recommend(number: int, choice: Choice, needs: Needs, reach: Reach, standing: Pose | None) -> RecommendedPass:
+def _recommend(
+    number: int, choice: Choice, needs: Needs, reach: Reach, standing: Pose | None, trust: float
+) -> RecommendedPass:
     stretch, prospect, served = choice.stretch, choice.prospect, choice.served
     spacing = stretch.line_spacing_mm
     promises = []
@@ -161,6 +164,7 @@ def _recommend(number: int, choice: Choice, needs: Needs, reach: Reach, standing
         place_regions=needs.region[served].astype(np.float64),
         place_mm2=needs.gain_mm2[served],
         turn=choice.attitude.turn,
+        trust=trust,
     )
 
 

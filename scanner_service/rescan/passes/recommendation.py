@@ -42,7 +42,7 @@ class RecommendedPass:
     `duration_s` is the time of the pass itself, `approach_s` the time to get there (turning the part included);
     `promises` what it is to give, region by region; `gain_mm2` their sum. `places_mm` (k, 3) are the places served,
     `place_regions` (k,) their regions and `place_mm2` (k,) their areas; they are kept for the reckoning afterwards.
-    `turn` is what the operator does first.
+    `turn` is what the operator does first; `trust` is what the promises were multiplied by, from earlier outcomes.
     """
 
     number: int
@@ -58,6 +58,7 @@ class RecommendedPass:
     place_regions: Float64Array
     place_mm2: Float64Array
     turn: PartTurn | None = None
+    trust: float = 1.0
 
     def __post_init__(self) -> None:
         for array in (self.places_mm, self.place_regions, self.place_mm2):
