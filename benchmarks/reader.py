@@ -10,7 +10,7 @@ import numpy.typing as npt
 from numba import njit
 
 from scanner_service.analysis.live_map import LiveMap
-from scanner_service.analysis.points import GROWTH, GROWTH_REACH, LISTED, PointArray
+from scanner_service.analysis.points import GROWTH, GROWTH_REACH, PointArray
 from scanner_service.analysis.snapshot import Int32Array, MapSnapshot, UInt8Array
 
 
@@ -35,7 +35,7 @@ def _take_over(
         normals[row, 1] = points[row].ny
         normals[row, 2] = points[row].nz
         reliable[row] = points[row].unreliable == 0
-        settled[row] = points[row].open_passes & ~np.uint8(LISTED) == 0
+        settled[row] = points[row].open_passes == 0
 
 
 class Reader:

@@ -6,6 +6,9 @@ import numpy as np
 
 from scanner_service.analysis.snapshot import Int32Array
 
+_SPARSE = 64
+"""Rows that are spread wider than this many times their number are sorted instead of marked."""
+
 
 class ChangeLog:
     """The latest versions of a map, each with the rows (m,) that changed in it."""
@@ -34,4 +37,17 @@ class ChangeLog:
         if not self._versions or self._versions[0][0] > version + 1:
             return None
         newer = [rows for at, rows in self._versions if at > version]
-        return np.sort(newer[0]) if len(newer) == 1 else np.unique(np.concatenate(newer))
+        return np.sort(newer[0]) if len(newer) == 1 else _union(newer)
+
+
+def _union(parts: list[Int32Array]) -> Int32Array:
+    """The rows that are in any of the parts, sorted, each once."""
+    rows = np.concatenate(parts)
+    if not len(rows):
+        return rows
+    low, high = int(rows.min()), int(rows.max())
+    if high - low > _SPARSE * len(rows):
+        return np.unique(rows)
+    is_in = np.zeros(high - low + 1, dtype=np.bool_)  # a scan changes rows that lie close together
+    is_in[rows - low] = True
+    return (np.flatnonzero(is_in) + low).astype(np.int32)

@@ -15,12 +15,12 @@ def describe(
     *,
     version: int,
     origin_mm: Float64Array,
-    line: Int32Array,
+    place: Int32Array,
     lines: LineTable,
     noise_mm: float,
     max_radius_mm: float,
 ) -> MapSnapshot:
-    """The snapshot of records (n,) whose scanlines are the rows `line` (n,) of `lines`."""
+    """The snapshot of records (n,) that lie at the places (n,) of their scanlines."""
     radius = used_radius_mm(points, max_radius_mm)
     neighbours = np.ascontiguousarray(points["neighbours"])
     unreliable = np.ascontiguousarray(points["unreliable"])
@@ -36,8 +36,8 @@ def describe(
         version=version,
         origin_mm=origin_mm.copy(),
         points_mm=origin_mm + np.column_stack([points["x"], points["y"], points["z"]]) * QUANTUM_MM,
-        line=line,
-        index=np.ascontiguousarray(points["place"]),
+        line=np.ascontiguousarray(points["line"]),
+        index=place,
         radius_mm=radius,
         radius_rule=np.where(points["growth"] > 0, np.uint8(RadiusRule.GROWN), points["rule"]),
         neighbours=neighbours,

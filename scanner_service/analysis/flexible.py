@@ -2,13 +2,12 @@
 
 import math
 
-import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-from scanner_service.analysis.gathering import gather_wide
-from scanner_service.analysis.grid import Grid, cell_of
-from scanner_service.analysis.intake import QUANTUM_MM
+from drivers.scanline import Float64Array
+from scanner_service.analysis.gathering import Scratch, gather, rings_for
+from scanner_service.analysis.grid import Grid, place_of
+from scanner_service.analysis.intake import PER_MM, QUANTUM_MM
 from scanner_service.analysis.kernel_rules import Rules
 from scanner_service.analysis.points import PointArray
 from scanner_service.analysis.radius import FLEXIBLE_POINTS
@@ -19,23 +18,20 @@ _REACHES = 1.0 + 1e-15
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def choose_flexible_radius(grid, points, row, cell, near, n, wide, n_wide, distances, rules):
-    """Set the point's radius to the distance of its 20th point, between c and r_max.
+def choose_flexible_radius(points, row, near, n, wide, n_wide, squares, side_q, rules):
+    """Set the point's radius to the distance of its 20th point, between c and r_max; False while that cannot be told.
 
-    Returns the buffer whose points cover that radius and how many they are, and the wide buffer with its count, which
-    is gathered at most once a cell. A point that looks beyond the neighbouring cells makes its cell needy.
+    It cannot when the cells next to the point's own, `near`, may not hold all points so near, and those as far as
+    r_max were not fetched into `wide` (`n_wide` negative).
     """
-    limit = math.floor((rules.max_radius_mm / QUANTUM_MM) ** 2)
-    certain = float(grid.side_q[0]) ** 2  # the cells around hold everything as near as one side
-    found = _twentieth(points, row, near, n, distances)
-    local, n_local = near, n
-    if found > certain and rules.max_radius_mm > grid.side_q[0] * QUANTUM_MM:
+    limit = math.floor((rules.max_radius_mm * PER_MM) ** 2)
+    certain = float(side_q - 1) ** 2  # the cells around hold everything as near as one side
+    found = _twentieth(points, row, near, n, squares)
+    may_be_far = found > certain or rules.uncertainty_mm * PER_MM > side_q - 1
+    if may_be_far and rings_for(rules.max_radius_mm, side_q) > 1:
         if n_wide < 0:
-            wide, n_wide = gather_wide(grid, cell, rules.max_radius_mm, wide)
-        found = _twentieth(points, row, wide, n_wide, distances)
-        local, n_local = wide, n_wide
-        grid.cell_needy[cell] = 1
-        grid.block_needy[grid.cell_block[cell]] = 1
+            return False
+        found = _twentieth(points, row, wide, n_wide, squares)
     if found > limit:
         radius_mm = rules.max_radius_mm
     else:
@@ -44,16 +40,15 @@ def choose_flexible_radius(grid, points, row, cell, near, n, wide, n_wide, dista
     if points[row].radius_mm != radius_mm:
         points[row].radius_mm = radius_mm
         points[row].changed_at = 0  # so that the new answer counts as another one
-    return local, n_local, wide, n_wide
+    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _twentieth(points, row, local, n, distances):
+def _twentieth(points, row, local, n, squares):
     """Squared distance of the FLEXIBLE_POINTS-th nearest candidate, the point itself counted; inf when fewer."""
     if n < FLEXIBLE_POINTS:
         return math.inf
     x, y, z = float(points[row].x), float(points[row].y), float(points[row].z)
-    squares = distances if n <= len(distances) else np.empty(n)
     highest = 0.0
     for k in range(n):
         dx, dy, dz = local[0, k] - x, local[1, k] - y, local[2, k] - z
@@ -93,19 +88,21 @@ def _count_up_to(squares, n, limit):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def flexible_radii_mm(rows: Int32Array, grid: Grid, points: PointArray, rules: Rules, radii: npt.NDArray[np.float64]):
+def flexible_radii_mm(
+    rows: Int32Array, grid: Grid, points: PointArray, rules: Rules, scratch: Scratch, radii: Float64Array
+) -> None:
     """The flexible radius of each row, put into `radii` (m,); the points keep theirs."""
-    wide = np.empty((4, 512))
-    distances = np.empty(512)
-    side = grid.side_q[0]
-    limit = math.floor((rules.max_radius_mm / QUANTUM_MM) ** 2)
+    wide, squares = scratch.wide, scratch.squares
+    block, bits, cell, chunk_next, chunk = grid.block, grid.bits, grid.cell, grid.chunk_next, grid.chunk
+    rings = rings_for(rules.max_radius_mm, grid.side_q[0])
+    limit = math.floor((rules.max_radius_mm * PER_MM) ** 2)
     for i in range(len(rows)):
         row = rows[i]
-        cell = cell_of(grid, points[row].x // side, points[row].y // side, points[row].z // side)
+        b, place = place_of(grid, points[row].x, points[row].y, points[row].z)
         radii[i] = rules.max_radius_mm
-        if cell < 0:
+        if b < 0:
             continue
-        wide, n = gather_wide(grid, cell, rules.max_radius_mm, wide)
-        found = _twentieth(points, row, wide, n, distances)
+        n = gather(block, bits, cell, chunk_next, chunk, b, place, rings, wide)
+        found = _twentieth(points, row, wide, n, squares)
         if found <= limit:
             radii[i] = max(QUANTUM_MM * math.sqrt(found) * _REACHES, rules.uncertainty_mm)

@@ -1,104 +1,140 @@
 """Fetching the points around a cell into a buffer for the kernels; judges nothing."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from scanner_service.analysis.grid import CHUNK, cell_near
+from drivers.scanline import Float64Array
+from scanner_service.analysis.around import AROUND_COUNT, AROUND_MASK, AROUND_NEAR, RINGS, lowest_bit
+from scanner_service.analysis.grid import CELL, CHUNK, COUNT, FILLED, FIRST, FRESH, NEAR, OLD, X, Y, Z
 from scanner_service.analysis.intake import QUANTUM_MM
+from scanner_service.analysis.vector_copy import widen_eight
 
 VECTOR = 16
 """The candidates are padded to a multiple of this, so that vector registers run full."""
 
 _FAR = 1e15
+_PAGE = 512  # numbers in a page of memory
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def cells_around(cell_at, cell_block, cell_count, block_key, block_near, block_cell, cell, rings, found):
-    """Put the cells up to `rings` away into `found`; returns how many, and how many points they hold."""
-    n_found = 0
-    n_points = np.int64(0)
-    for dx in range(-rings, rings + 1):
-        for dy in range(-rings, rings + 1):
-            for dz in range(-rings, rings + 1):
-                other = cell_near(cell_at, cell_block, block_key, block_near, block_cell, cell, dx, dy, dz)
-                if other >= 0:
-                    found[n_found] = other
-                    n_found += 1
-                    n_points += cell_count[other]
-    return n_found, n_points
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def rings_for(radius_mm, side_q):
+    """How many cells far a point with this radius looks; more than RINGS are never needed."""
+    return min(RINGS, math.ceil((radius_mm / QUANTUM_MM + 1.0) / side_q))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def gather(chunk_next, chunk_xyz, chunk_line, cell_first, cell_count, found, n_found, buffer):
-    """Copy x, y, z and line of every point in the cells found, and pad."""
-    n = 0
-    for k in range(n_found):
-        chunk = cell_first[found[k]]
-        left = cell_count[found[k]]
-        while left > 0:
-            here = min(left, CHUNK)
-            for j in range(CHUNK):  # a whole chunk at once: what is beyond its end is overwritten or padded
-                buffer[0, n + j] = chunk_xyz[chunk, 0, j]
-                buffer[1, n + j] = chunk_xyz[chunk, 1, j]
-                buffer[2, n + j] = chunk_xyz[chunk, 2, j]
-                buffer[3, n + j] = chunk_line[chunk, j]
-            n += here
-            left -= here
-            chunk = chunk_next[chunk]
-    for j in range(VECTOR):
-        buffer[0, n + j] = _FAR
-        buffer[1, n + j], buffer[2, n + j], buffer[3, n + j] = 0.0, 0.0, 0.0
+class Scratch(NamedTuple):
+    """Buffers of one thread, large enough for the fullest cells, of which only what is touched becomes memory.
+
+    `near`, `wide` and `fresh` (4, N) hold x, y, z and line of points around; `squares` (N,) distances; `kept` (21,)
+    sums and fit of one point.
+    """
+
+    near: Float64Array
+    wide: Float64Array
+    fresh: Float64Array
+    squares: Float64Array
+    kept: Float64Array
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def gather_fresh(
-    chunk_next, chunk_xyz, chunk_point, cell_first, cell_last, cell_count, found, n_found, first_new, fresh
-):
-    """Copy the coordinates of those points in the cells found that are new, and pad; returns how many."""
+def reserve_scratch(cell_limit: int) -> Scratch:
+    """Buffers for cells of at most `cell_limit` points."""
+    around, far = 27 * cell_limit, (2 * RINGS + 1) ** 3 * cell_limit
+    return Scratch(_rows(4, around), _rows(4, far), _rows(4, far), _rows(1, far)[0], np.empty(21))
+
+
+def _rows(count: int, length: int) -> Float64Array:
+    """(count, N) with room for `length` and padding in each row, so placed that vector registers load without a split.
+
+    Rows begin at cache lines, and at different places within a page: the processor takes addresses that differ by
+    whole pages for the same when it looks for what was just written.
+    """
+    stride = -(-(length + 2 * VECTOR) // _PAGE) * _PAGE + _PAGE // 4 + 8
+    room = np.empty(count * stride + 8)
+    skipped = (-room.ctypes.data % 64) // 8
+    rows: Float64Array = room[skipped : skipped + count * stride].reshape(count, stride)
+    return rows
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def gather(block, bits, cell, chunk_next, chunk, b, place, rings, buffer):
+    """Copy x, y, z and line of every point in the cells up to `rings` away into the buffer (4, N), and pad.
+
+    Returns how many points there are.
+    """
     n = np.int64(0)
-    for k in range(n_found):
-        cell = found[k]
-        if chunk_point[cell_last[cell], (cell_count[cell] - 1) % CHUNK] < first_new:
-            continue  # rows of a cell ascend: its last is its newest
-        chunk = cell_first[cell]
-        left = cell_count[cell]
-        while left > 0:
-            here = min(left, CHUNK)
-            for j in range(here):
-                if chunk_point[chunk, j] >= first_new:
-                    fresh[0, n] = chunk_xyz[chunk, 0, j]
-                    fresh[1, n] = chunk_xyz[chunk, 1, j]
-                    fresh[2, n] = chunk_xyz[chunk, 2, j]
-                    n += 1
-            left -= here
-            chunk = chunk_next[chunk]
+    for k in range(AROUND_COUNT[rings, place]):
+        other = np.int64(block[b, NEAR + AROUND_NEAR[rings, place, k]])
+        if other < 0:
+            continue
+        mask = bits[other, FILLED] & AROUND_MASK[rings, place, k]
+        while mask != np.uint64(0):
+            c = np.int64(block[other, CELL + lowest_bit(mask)])
+            mask &= mask - np.uint64(1)
+            here = np.int64(cell[c, FIRST])
+            left = np.int64(cell[c, COUNT])
+            while True:
+                for column in range(4):  # a whole chunk at once: what is beyond its end is overwritten or padded
+                    widen_eight(chunk, here, column, buffer, n)
+                n += min(left, CHUNK)
+                left -= CHUNK
+                if left <= 0:
+                    break
+                here = np.int64(chunk_next[here])
+    for at in range(VECTOR):
+        buffer[0, n + at] = _FAR
+        buffer[1, n + at], buffer[2, n + at], buffer[3, n + at] = 0.0, 0.0, 0.0
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def is_reached(points, row, fresh, n_fresh):
-    """True when a new point lies within the radius of a point."""
-    x, y, z = float(points[row].x), float(points[row].y), float(points[row].z)
-    reach = math.floor((points[row].radius_mm / QUANTUM_MM) ** 2)
-    reached = False
-    for k in range(n_fresh):
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def has_fresh(block, bits, b, place, rings):
+    """True when a cell up to `rings` away is fresh."""
+    for k in range(AROUND_COUNT[rings, place]):
+        other = np.int64(block[b, NEAR + AROUND_NEAR[rings, place, k]])
+        if other >= 0 and bits[other, FRESH] & AROUND_MASK[rings, place, k] != np.uint64(0):
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def gather_fresh(block, bits, cell, chunk_next, chunk, b, place, rings, fresh):
+    """Copy the coordinates of what is new in the fresh cells up to `rings` away, and pad, as `gather` does."""
+    n = np.int64(0)
+    for k in range(AROUND_COUNT[rings, place]):
+        other = np.int64(block[b, NEAR + AROUND_NEAR[rings, place, k]])
+        if other < 0:
+            continue
+        mask = bits[other, FRESH] & AROUND_MASK[rings, place, k]
+        while mask != np.uint64(0):
+            c = np.int64(block[other, CELL + lowest_bit(mask)])
+            mask &= mask - np.uint64(1)
+            at, end = np.int64(cell[c, OLD]), np.int64(cell[c, COUNT])
+            here = np.int64(cell[c, FIRST])
+            while at >= CHUNK:
+                here = np.int64(chunk_next[here])
+                at -= CHUNK
+                end -= CHUNK
+            while at < end:
+                fresh[0, n], fresh[1, n], fresh[2, n] = chunk[here, X, at], chunk[here, Y, at], chunk[here, Z, at]
+                n += 1
+                at += 1
+                if at == CHUNK:
+                    here = np.int64(chunk_next[here])
+                    at = np.int64(0)
+                    end -= CHUNK
+    for at in range(VECTOR):
+        fresh[0, n + at], fresh[1, n + at], fresh[2, n + at] = _FAR, 0.0, 0.0
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={"reassoc", "nsz", "nnan"})
+def is_reached(x, y, z, reach, fresh, n_fresh):
+    """True when one of the new points lies within a squared distance of (x, y, z)."""
+    reached = 0.0
+    for k in range(((n_fresh + VECTOR - 1) // VECTOR) * VECTOR):
         dx, dy, dz = fresh[0, k] - x, fresh[1, k] - y, fresh[2, k] - z
-        reached |= dx * dx + dy * dy + dz * dz <= reach + 1.0
-    return reached
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def gather_wide(grid, cell, limit_mm, wide):
-    """All points as far as a radius may grow: the buffer, a larger one if need be, and how many it holds."""
-    rings = min(4, math.ceil(limit_mm / (grid.side_q[0] * QUANTUM_MM)))
-    found = np.empty(729, dtype=np.int64)
-    n_found, n = cells_around(
-        grid.cell_at, grid.cell_block, grid.cell_count, grid.block_key, grid.block_near, grid.block_cell,
-        cell, rings, found,
-    )  # fmt: skip
-    if n + VECTOR > wide.shape[1]:
-        wide = np.empty((4, 2 * n + VECTOR))
-    gather(grid.chunk_next, grid.chunk_xyz, grid.chunk_line, grid.cell_first, grid.cell_count, found, n_found, wide)
-    return wide, n
+        reached += 1.0 if dx * dx + dy * dy + dz * dz <= reach else 0.0
+    return reached > 0.0

@@ -1,100 +1,90 @@
-"""A sparse grid of cells that hold points: where things are; knows nothing of neighbourhoods, lines or normals.
+"""A sparse grid of cells: a hash table of blocks of 4 x 4 x 4 cells, each cell a chain of chunks of points.
 
-Space is cut into cubic cells of side `side_q` quanta. 4 x 4 x 4 cells form a block; blocks are found by a hash of
-their coordinates and know their 26 neighbours, so a cell's surroundings cost at most one look-up a block. A cell
-holds its points in chunks of CHUNK, each with its own copy of the coordinates, so that reading a neighbourhood
-touches little memory. All arrays are reserved at the ceiling: the operating system gives pages when they are first
-touched, so growth never copies and no scanline waits for it.
+Knows stored coordinates and scanlines, no neighbourhoods. Nothing is ever moved: a cell keeps its number, a point its
+place, and memory comes into being as it is touched, so no line waits for a table to grow.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from scanner_service.analysis.around import AROUND_COUNT, AROUND_MASK, AROUND_NEAR, BLOCK_CELLS, lowest_bit
 from scanner_service.analysis.points import PointArray
 from scanner_service.analysis.snapshot import Int32Array, UInt8Array
 
-CHUNK = 8
-BLOCK_CELLS = 64
-QUEUED, SPREAD = 1, 2
+CHUNK = 6
+X, Y, Z, LINE, ROW = range(5)
 SMALLEST_SIDE_Q = 2048
 """Cells are never smaller than this, so that cell coordinates stay below 2^20."""
 
 
 class Grid(NamedTuple):
-    """The grid's arrays; `*_used` are one-element counters, index -1 means none.
+    """The grid's arrays; index -1 means none.
 
-    `hash_block` (2^k,) holds block + 1 or 0; `block_key` (B, 3) block coordinates; `block_near` (B, 27) neighbouring
-    blocks; `block_cell` (B, 64) the cell at each place; `block_needy` (B,) 1 once one of its cells was needy, and
-    `block_round` (B,) the round in which those around were queued. `cell_at` (C, 3) cell coordinates, `cell_block`
-    (C,), `cell_first`, `cell_last` (C,) chunks, `cell_count` (C,) points, `cell_needy` (C,) 1 when a point of it looks
-    farther than the neighbouring cells, `cell_stale` (C,) QUEUED in `stale` (C,), or SPREAD when its neighbours are
-    queued too. `chunk_next` (K,), `chunk_xyz` (K, 3, CHUNK) int32 coordinates, `chunk_line` (K, CHUNK) scanlines and
-    `chunk_point` (K, CHUNK) point rows, ascending along a cell. `round` counts evaluations.
+    `used` (6,) counts blocks, cells, chunks, blocks listed in `fresh`, evaluations, and rows that share an entry.
+    `hash_block` (2^k,) holds block + 1 or 0. `block` (B, 96) holds the 27 blocks around (NEAR), the cells of the 64
+    places (CELL), three block coordinates (KEY) and the evaluation for which the block was last listed (ROUND).
+
+    `bits` (B, 8) has a bit a place: FILLED, it holds points; FRESH, it got or lost one since the last evaluation;
+    NEXT_TO, it or a cell next to it is fresh, while that is evaluated; FAR, FAR + 1, FAR + 2, a point of it looks at
+    least 2, 3 or 4 cells far; DOUBLED, an entry of it stands for several rows. `block_laser_q` (B, 2, 3) is the box of
+    the lasers that saw the block's points, and `fresh` (B,) lists the blocks with fresh cells.
+
+    `cell` (C, 4) holds first and last chunk, the number of entries and, in a fresh cell, how many of them are older
+    than the last evaluation. `chunk` (K, 5, CHUNK) holds x, y, z, scanline and point row of each entry, rows ascending
+    along a cell, and `chunk_next` (K,) the chunk behind. In crowded cells the rows of a scanline that have the same
+    coordinates share an entry: `more` (K, CHUNK) says how many rows beside its own it stands for, and `next_double`
+    (P,) leads from each row to the next of them, by row + 1, 0 at the end.
     """
 
     side_q: npt.NDArray[np.int64]
+    used: npt.NDArray[np.int64]
     hash_block: Int32Array
-    blocks_used: npt.NDArray[np.int64]
-    block_key: Int32Array
-    block_near: Int32Array
-    block_cell: Int32Array
-    block_needy: UInt8Array
-    block_round: Int32Array
-    cells_used: npt.NDArray[np.int64]
-    cell_at: Int32Array
-    cell_block: Int32Array
-    cell_first: Int32Array
-    cell_last: Int32Array
-    cell_count: Int32Array
-    cell_stale: UInt8Array
-    cell_needy: UInt8Array
-    stale_used: npt.NDArray[np.int64]
-    stale: Int32Array
-    chunks_used: npt.NDArray[np.int64]
+    block: Int32Array
+    bits: npt.NDArray[np.uint64]
+    block_laser_q: npt.NDArray[np.float64]
+    fresh: Int32Array
+    cell: Int32Array
     chunk_next: Int32Array
-    chunk_xyz: Int32Array
-    chunk_line: Int32Array
-    chunk_point: Int32Array
-    round: Int32Array
+    chunk: Int32Array
+    more: Int32Array
+    next_double: Int32Array
+
+
+BLOCKS, CELLS, CHUNKS, FRESH_BLOCKS, EVALUATIONS, DOUBLES = range(6)
+NEAR, CELL, KEY, ROUND = 0, 27, 91, 94
+FILLED, FRESH, NEXT_TO, FAR, DOUBLED = 0, 1, 2, 3, 6
+FIRST, LAST, COUNT, OLD = range(4)
+
+
+CROWDED = 64
+"""A cell with so many entries looks for the same point before it takes another."""
+
+
+def cell_side_q(radius_mm: float, quantum_mm: float) -> int:
+    """Side of cells in which a radius never reaches beyond the next cell, rounding of cell coordinates included."""
+    return max(math.ceil(radius_mm / quantum_mm) + 1, SMALLEST_SIDE_Q)
 
 
 def reserve_grid(side_q: int, max_points: int) -> Grid:
     """An empty grid with room for `max_points` points in cells of `side_q` quanta."""
-    cells = max_points
-    blocks = max(1024, max_points // 4)
-    hash_size = 1 << (2 * blocks - 1).bit_length()
-
-    def counter() -> npt.NDArray[np.int64]:
-        return np.zeros(1, dtype=np.int64)
-
+    blocks = max(1024, max_points // 8)
     return Grid(
         side_q=np.array([side_q], dtype=np.int64),
-        hash_block=np.zeros(hash_size, dtype=np.int32),
-        blocks_used=counter(),
-        block_key=np.empty((blocks, 3), dtype=np.int32),
-        block_near=np.empty((blocks, 27), dtype=np.int32),
-        block_cell=np.empty((blocks, BLOCK_CELLS), dtype=np.int32),
-        block_needy=np.zeros(blocks, dtype=np.uint8),
-        block_round=np.zeros(blocks, dtype=np.int32),
-        cells_used=counter(),
-        cell_at=np.empty((cells, 3), dtype=np.int32),
-        cell_block=np.empty(cells, dtype=np.int32),
-        cell_first=np.empty(cells, dtype=np.int32),
-        cell_last=np.empty(cells, dtype=np.int32),
-        cell_count=np.empty(cells, dtype=np.int32),
-        cell_stale=np.empty(cells, dtype=np.uint8),
-        cell_needy=np.empty(cells, dtype=np.uint8),
-        stale_used=counter(),
-        stale=np.empty(cells, dtype=np.int32),
-        chunks_used=counter(),
-        chunk_next=np.empty(cells, dtype=np.int32),
-        chunk_xyz=np.empty((cells, 3, CHUNK), dtype=np.int32),
-        chunk_line=np.empty((cells, CHUNK), dtype=np.int32),
-        chunk_point=np.empty((cells, CHUNK), dtype=np.int32),
-        round=np.ones(1, dtype=np.int32),
+        used=np.zeros(6, dtype=np.int64),
+        hash_block=np.zeros(1 << (blocks + blocks // 2).bit_length(), dtype=np.int32),
+        block=np.empty((blocks, 96), dtype=np.int32),
+        bits=np.empty((blocks, 8), dtype=np.uint64),
+        block_laser_q=np.empty((blocks, 2, 3), dtype=np.float64),
+        fresh=np.empty(blocks, dtype=np.int32),
+        cell=np.empty((max_points, 4), dtype=np.int32),
+        chunk_next=np.empty(max_points, dtype=np.int32),
+        chunk=np.empty((max_points, 5, CHUNK), dtype=np.int32),
+        more=np.zeros((max_points, CHUNK), dtype=np.int32),
+        next_double=np.zeros(max_points, dtype=np.int32),
     )
 
 
@@ -103,249 +93,311 @@ def reserve_grid(side_q: int, max_points: int) -> Grid:
 
 
 @njit(cache=True, nogil=True)
-def _slot(hash_block, block_key, bx, by, bz):
+def _slot(hash_block, block, bx, by, bz):
     """The place of a block in the hash table: its own, or the empty one where it belongs."""
+    # Blocks near each other share a page of the table, or a scan would touch all of it at once.
     mask = len(hash_block) - 1
-    h = np.uint64(bx) * np.uint64(0x9E3779B97F4A7C15)
-    h ^= np.uint64(by) * np.uint64(0xC2B2AE3D27D4EB4F)
-    h ^= np.uint64(bz) * np.uint64(0x165667B19E3779F9)
+    h = np.uint64(bx >> 3) * np.uint64(0x9E3779B97F4A7C15)
+    h ^= np.uint64(by >> 3) * np.uint64(0xC2B2AE3D27D4EB4F)
+    h ^= np.uint64(bz >> 3) * np.uint64(0x165667B19E3779F9)
     h ^= h >> np.uint64(29)
+    h = (h << np.uint64(9)) | np.uint64(((bx & 7) << 6) | ((by & 7) << 3) | (bz & 7))
     slot = np.int64(h & np.uint64(mask))
     while True:
-        block = hash_block[slot] - 1
-        if block < 0 or (block_key[block, 0] == bx and block_key[block, 1] == by and block_key[block, 2] == bz):
+        b = hash_block[slot] - 1
+        if b < 0 or (block[b, KEY] == bx and block[b, KEY + 1] == by and block[b, KEY + 2] == bz):
             return slot
         slot = (slot + 1) & mask
 
 
 @njit(cache=True, nogil=True)
-def _block_at(hash_block, blocks_used, block_key, block_near, block_cell, bx, by, bz):
+def _block_at(hash_block, used, block, bits, block_laser_q, bx, by, bz):
     """The block at these block coordinates, made if it is not there; -1 when no block is left."""
-    slot = _slot(hash_block, block_key, bx, by, bz)
-    block = np.int64(hash_block[slot] - 1)
-    if block >= 0:
-        return block
-    block = blocks_used[0]
-    if block >= len(block_key):
+    slot = _slot(hash_block, block, bx, by, bz)
+    b = np.int64(hash_block[slot] - 1)
+    if b >= 0:
+        return b
+    b = used[BLOCKS]
+    if b >= len(block):
         return np.int64(-1)
-    blocks_used[0] = block + 1
-    hash_block[slot] = block + 1
-    block_key[block, 0], block_key[block, 1], block_key[block, 2] = bx, by, bz
+    used[BLOCKS] = b + 1
+    hash_block[slot] = b + 1
+    block[b, KEY], block[b, KEY + 1], block[b, KEY + 2] = bx, by, bz
+    block[b, ROUND] = -1
     for place in range(BLOCK_CELLS):
-        block_cell[block, place] = -1
+        block[b, CELL + place] = -1
+    for k in range(8):
+        bits[b, k] = 0
+    for axis in range(3):
+        block_laser_q[b, 0, axis], block_laser_q[b, 1, axis] = math.inf, -math.inf
     for near in range(27):
         if near == 13:
-            block_near[block, near] = block
+            block[b, NEAR + near] = b
             continue
         dx, dy, dz = near // 9 - 1, (near // 3) % 3 - 1, near % 3 - 1
-        other = hash_block[_slot(hash_block, block_key, bx + dx, by + dy, bz + dz)] - 1
-        block_near[block, near] = other
+        other = hash_block[_slot(hash_block, block, bx + dx, by + dy, bz + dz)] - 1
+        block[b, NEAR + near] = other
         if other >= 0:
-            block_near[other, 26 - near] = block
-    return block
+            block[other, NEAR + 26 - near] = b
+    return b
 
 
 @njit(cache=True, nogil=True)
-def cell_near(cell_at, cell_block, block_key, block_near, block_cell, cell, dx, dy, dz):
-    """The cell at an offset of at most 4 cells from `cell`, or -1 when nothing is there."""
-    x, y, z = cell_at[cell, 0] + dx, cell_at[cell, 1] + dy, cell_at[cell, 2] + dz
-    block = cell_block[cell]
-    bx, by, bz = block_key[block, 0], block_key[block, 1], block_key[block, 2]
-    near = ((x >> 2) - bx + 1) * 9 + ((y >> 2) - by + 1) * 3 + (z >> 2) - bz + 1
-    block = block_near[block, near]
-    if block < 0:
-        return np.int64(-1)
-    return np.int64(block_cell[block, ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)])
-
-
-@njit(cache=True, nogil=True)
-def cell_of(grid: Grid, x: int, y: int, z: int) -> int:
-    """The cell at these cell coordinates, or -1 when nothing is there."""
-    block = grid.hash_block[_slot(grid.hash_block, grid.block_key, x >> 2, y >> 2, z >> 2)] - 1
-    if block < 0:
-        return np.int64(-1)
-    return np.int64(grid.block_cell[block, ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)])
+def place_of(grid: Grid, x: int, y: int, z: int) -> tuple[int, int]:
+    """Block, and place in it, of the stored coordinates; block -1 when nothing is there."""
+    per_side = 1.0 / grid.side_q[0]
+    cx, cy, cz = math.floor(x * per_side), math.floor(y * per_side), math.floor(z * per_side)
+    b = grid.hash_block[_slot(grid.hash_block, grid.block, cx >> 2, cy >> 2, cz >> 2)] - 1
+    return np.int64(b), ((cx & 3) << 4) | ((cy & 3) << 2) | (cz & 3)
 
 
 @njit(cache=True, nogil=True)
 def insert_points(
-    grid: Grid, points: PointArray, first_row: int, line: int, cell_limit: int, counted: UInt8Array
+    grid: Grid,
+    points: PointArray,
+    first_row: int,
+    line: int,
+    laser_q: npt.NDArray[np.float64],
+    cell_limit: int,
+    shares: bool,
+    counted: UInt8Array,
 ) -> int:
-    """Put the points of a line, rows first_row, first_row + 1, ..., into their cells; queue what they reach.
+    """Put the points of a line, rows first_row, first_row + 1, ..., into their cells, and mark these as fresh.
 
-    What they reach: their cells, the 26 around each, and the needy cells of the blocks around. A cell that is made
-    later in the round queues itself, so what was spread once in a round needs no second time.
-
+    `laser_q` (3,) is the line's laser position; with `shares` rows with the same coordinates may share an entry.
     `counted` (k,) comes in as 1 for points to insert and 0 for points to pass over, and goes out with 0 where a cell
-    already holds `cell_limit` points. Returns how many points were taken in hand; fewer than k means the grid is full.
+    already holds `cell_limit` entries. Returns how many points were taken in hand; fewer than k means the grid is full.
     """
-    hash_block, blocks_used, block_key = grid.hash_block, grid.blocks_used, grid.block_key
-    block_near, block_cell, block_needy = grid.block_near, grid.block_cell, grid.block_needy
-    cell_needy = grid.cell_needy
-    block_round, cells_used, cell_at, cell_block = grid.block_round, grid.cells_used, grid.cell_at, grid.cell_block
-    cell_first, cell_last, cell_count, cell_stale = grid.cell_first, grid.cell_last, grid.cell_count, grid.cell_stale
-    stale_used, stale, chunks_used, chunk_next = grid.stale_used, grid.stale, grid.chunks_used, grid.chunk_next
-    chunk_xyz, chunk_line, chunk_point = grid.chunk_xyz, grid.chunk_line, grid.chunk_point
-    side, this_round = grid.side_q[0], grid.round[0]
-    cell, block = np.int64(-1), np.int64(-1)
-    lx, ly, lz = np.int64(0), np.int64(0), np.int64(0)
+    used, hash_block, block, bits, fresh = grid.used, grid.hash_block, grid.block, grid.bits, grid.fresh
+    block_laser_q, cell, chunk_next, chunk = grid.block_laser_q, grid.cell, grid.chunk_next, grid.chunk
+    per_side = 1.0 / grid.side_q[0]
+    lx, ly, lz = laser_q[0], laser_q[1], laser_q[2]
+    c, b = np.int64(-1), np.int64(-1)
+    ax, ay, az = 0, 0, 0
     for i in range(len(counted)):
         if counted[i] == 0:
             continue
         row = first_row + i
         px, py, pz = points[row].x, points[row].y, points[row].z
-        x, y, z = px // side, py // side, pz // side
-        if cell < 0 or x != lx or y != ly or z != lz:
-            if cell < 0 or x >> 2 != lx >> 2 or y >> 2 != ly >> 2 or z >> 2 != lz >> 2:
-                block = _block_at(hash_block, blocks_used, block_key, block_near, block_cell, x >> 2, y >> 2, z >> 2)
-                if block < 0:
+        x, y, z = math.floor(px * per_side), math.floor(py * per_side), math.floor(pz * per_side)
+        if c < 0 or x != ax or y != ay or z != az:
+            if b < 0 or x >> 2 != ax >> 2 or y >> 2 != ay >> 2 or z >> 2 != az >> 2:
+                near = _near_of((x >> 2) - (ax >> 2), (y >> 2) - (ay >> 2), (z >> 2) - (az >> 2))
+                known = np.int64(block[b, NEAR + near]) if b >= 0 and near >= 0 else np.int64(-1)
+                b = known
+                if b < 0:
+                    b = _block_at(hash_block, used, block, bits, block_laser_q, x >> 2, y >> 2, z >> 2)
+                if b < 0:
                     return i
+                _stretch(block_laser_q, b, lx, ly, lz)
             place = ((x & 3) << 4) | ((y & 3) << 2) | (z & 3)
-            cell = np.int64(block_cell[block, place])
-            if cell < 0:
-                cell = cells_used[0]
-                if cell >= len(cell_block):
+            c = np.int64(block[b, CELL + place])
+            if c < 0:
+                c = used[CELLS]
+                if c >= len(cell):
                     return i
-                cells_used[0] = cell + 1
-                block_cell[block, place] = cell
-                cell_at[cell, 0], cell_at[cell, 1], cell_at[cell, 2] = x, y, z
-                cell_block[cell] = block
-                cell_first[cell] = -1
-                cell_last[cell] = -1
-                cell_count[cell] = 0
-                cell_stale[cell] = 0
-                cell_needy[cell] = 0
-            if cell_stale[cell] != SPREAD:
-                _queue_around(
-                    cell_at, cell_block, block_key, block_near, block_cell, cell_stale, stale, stale_used, cell
-                )
-                if block_round[block] != this_round:
-                    block_round[block] = this_round
-                    _queue_needy(block_near, block_needy, block_cell, cell_needy, cell_stale, stale, stale_used, block)
-            lx, ly, lz = x, y, z
-        count = cell_count[cell]
+                used[CELLS] = c + 1
+                block[b, CELL + place] = c
+                cell[c, FIRST], cell[c, LAST], cell[c, COUNT], cell[c, OLD] = -1, -1, 0, 0
+            if _mark_fresh(bits, fresh, used, b, place):
+                cell[c, OLD] = cell[c, COUNT]
+            bits[b, FILLED] |= np.uint64(1) << np.uint64(place)
+            ax, ay, az = x, y, z
+        count = np.int64(cell[c, COUNT])
+        if count >= CROWDED and shares and _share(grid, points, c, row):
+            bits[b, DOUBLED] |= np.uint64(1) << np.uint64(place)
+            continue
         if count >= cell_limit:
             counted[i] = 0
             continue
-        place = count % CHUNK
-        chunk = np.int64(cell_last[cell])
-        if place == 0:
-            if count == 0 and chunk >= 0:  # emptied by a removal: its first chunk is free again
-                chunk = np.int64(cell_first[cell])
-            elif count > 0 and chunk_next[chunk] >= 0:  # shortened by a removal
-                chunk = np.int64(chunk_next[chunk])
+        at = count % CHUNK
+        last = np.int64(cell[c, LAST])
+        if at == 0:
+            if count == 0 and last >= 0:  # emptied by a removal: its first chunk is free again
+                last = np.int64(cell[c, FIRST])
+            elif count > 0 and chunk_next[last] >= 0:  # shortened by a removal
+                last = np.int64(chunk_next[last])
             else:
-                chunk = chunks_used[0]
-                if chunk >= len(chunk_next):
+                last = used[CHUNKS]
+                if last >= len(chunk_next):
                     return i
-                chunks_used[0] = chunk + 1
-                chunk_next[chunk] = -1
+                used[CHUNKS] = last + 1
+                chunk_next[last] = -1
                 if count == 0:
-                    cell_first[cell] = chunk
+                    cell[c, FIRST] = last
                 else:
-                    chunk_next[cell_last[cell]] = chunk
-            cell_last[cell] = chunk
-        chunk_xyz[chunk, 0, place] = px
-        chunk_xyz[chunk, 1, place] = py
-        chunk_xyz[chunk, 2, place] = pz
-        chunk_line[chunk, place] = line
-        chunk_point[chunk, place] = row
-        cell_count[cell] = count + 1
+                    chunk_next[cell[c, LAST]] = last
+            cell[c, LAST] = last
+        chunk[last, X, at] = px
+        chunk[last, Y, at] = py
+        chunk[last, Z, at] = pz
+        chunk[last, LINE, at] = line
+        chunk[last, ROW, at] = row
+        cell[c, COUNT] = count + 1
     return len(counted)
 
 
 @njit(cache=True, nogil=True)
-def _queue_around(cell_at, cell_block, block_key, block_near, block_cell, cell_stale, stale, stale_used, cell):
-    """Queue a cell and the 26 around it."""
-    for dx in range(-1, 2):
-        for dy in range(-1, 2):
-            for dz in range(-1, 2):
-                near = cell_near(cell_at, cell_block, block_key, block_near, block_cell, cell, dx, dy, dz)
-                if near >= 0 and cell_stale[near] == 0:
-                    cell_stale[near] = QUEUED
-                    stale[stale_used[0]] = near
-                    stale_used[0] += 1
-    cell_stale[cell] = SPREAD
+def _share(grid, points, c, row):
+    """Let a row share the entry of a cell with the same coordinates, scanline and radius; False when there is none."""
+    chunk, cell = grid.chunk, grid.cell
+    here, left = np.int64(cell[c, FIRST]), np.int64(cell[c, COUNT])
+    x, y, z, line = points[row].x, points[row].y, points[row].z, points[row].line
+    while left > 0:
+        for at in range(min(left, CHUNK)):
+            if chunk[here, X, at] == x and chunk[here, Y, at] == y and chunk[here, Z, at] == z:
+                other = chunk[here, ROW, at]
+                if chunk[here, LINE, at] == line and points[other].radius_mm == points[row].radius_mm:
+                    grid.more[here, at] += 1
+                    grid.next_double[row] = grid.next_double[other]
+                    grid.next_double[other] = row + 1
+                    grid.used[DOUBLES] += 1
+                    return True
+        left -= CHUNK
+        here = np.int64(grid.chunk_next[here])
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _near_of(dx, dy, dz):
+    """Number of the neighbouring block at this offset, -1 when it is no neighbour."""
+    if abs(dx) > 1 or abs(dy) > 1 or abs(dz) > 1:
+        return -1
+    return 9 * (dx + 1) + 3 * (dy + 1) + dz + 1
+
+
+@njit(cache=True, nogil=True)
+def _stretch(block_laser_q, block, x, y, z):
+    """Widen the box of a block's lasers."""
+    block_laser_q[block, 0, 0], block_laser_q[block, 1, 0] = (
+        min(block_laser_q[block, 0, 0], x), max(block_laser_q[block, 1, 0], x),
+    )  # fmt: skip
+    block_laser_q[block, 0, 1], block_laser_q[block, 1, 1] = (
+        min(block_laser_q[block, 0, 1], y), max(block_laser_q[block, 1, 1], y),
+    )  # fmt: skip
+    block_laser_q[block, 0, 2], block_laser_q[block, 1, 2] = (
+        min(block_laser_q[block, 0, 2], z), max(block_laser_q[block, 1, 2], z),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _mark_fresh(bits, fresh, used, b, place):
+    """Note that something changed in a cell; False when that was known."""
+    before = bits[b, FRESH]
+    bit = np.uint64(1) << np.uint64(place)
+    if before & bit != np.uint64(0):
+        return False
+    if before == np.uint64(0):
+        fresh[used[FRESH_BLOCKS]] = b
+        used[FRESH_BLOCKS] += 1
+    bits[b, FRESH] = before | bit
+    return True
 
 
 @njit(cache=True, nogil=True)
 def remove_points(grid: Grid, points: PointArray, rows: Int32Array) -> int:
-    """Take points out of their cells and queue what they reached; returns how many were found there."""
-    block_key, block_near, block_cell = grid.block_key, grid.block_near, grid.block_cell
-    block_needy, cell_at, cell_block, cell_stale = grid.block_needy, grid.cell_at, grid.cell_block, grid.cell_stale
-    cell_needy = grid.cell_needy
-    stale, stale_used, cell_first, cell_last = grid.stale, grid.stale_used, grid.cell_first, grid.cell_last
-    cell_count, chunk_next, chunk_point = grid.cell_count, grid.chunk_next, grid.chunk_point
-    chunk_xyz, chunk_line, side = grid.chunk_xyz, grid.chunk_line, grid.side_q[0]
+    """Take points out of their cells and mark these as fresh; returns how many were found there.
+
+    Rows that share an entry are of one scanline and go together.
+    """
+    bits, cell, chunk_next, chunk, more = grid.bits, grid.cell, grid.chunk_next, grid.chunk, grid.more
     removed = 0
-    for i in range(len(rows)):
-        row = rows[i]
-        cell = cell_of(grid, points[row].x // side, points[row].y // side, points[row].z // side)
-        if cell < 0:
+    for row in rows:
+        b, place = place_of(grid, points[row].x, points[row].y, points[row].z)
+        c = np.int64(grid.block[b, CELL + place]) if b >= 0 else np.int64(-1)
+        if c < 0:
             continue
         # Everything behind the row moves one place forward: the rows of a cell stay in ascending order.
-        to_chunk, to_place, found = np.int64(-1), 0, False
-        chunk, left = cell_first[cell], cell_count[cell]
+        to_chunk, to_at, found = np.int64(-1), 0, False
+        here, left = np.int64(cell[c, FIRST]), np.int64(cell[c, COUNT])
         before_last = np.int64(-1)
         while left > 0:
-            for j in range(min(left, CHUNK)):
+            for at in range(min(left, CHUNK)):
                 if found:
-                    for axis in range(3):
-                        chunk_xyz[to_chunk, axis, to_place] = chunk_xyz[chunk, axis, j]
-                    chunk_line[to_chunk, to_place] = chunk_line[chunk, j]
-                    chunk_point[to_chunk, to_place] = chunk_point[chunk, j]
-                elif chunk_point[chunk, j] == row:
+                    for column in range(5):
+                        chunk[to_chunk, column, to_at] = chunk[here, column, at]
+                    more[to_chunk, to_at] = more[here, at]
+                elif chunk[here, ROW, at] == row:
                     found = True
+                    removed += 1 + more[here, at]
+                    grid.used[DOUBLES] -= more[here, at]
                 if found:
-                    to_chunk, to_place = chunk, j
+                    to_chunk, to_at = here, at
             left -= CHUNK
             if left > 0:
-                before_last = chunk
-            chunk = chunk_next[chunk]
+                before_last = here
+            here = np.int64(chunk_next[here])
         if not found:
             continue
-        removed += 1
-        cell_count[cell] -= 1
-        if cell_count[cell] % CHUNK == 0 and cell_count[cell] > 0:
-            cell_last[cell] = before_last
-        _queue_around(cell_at, cell_block, block_key, block_near, block_cell, cell_stale, stale, stale_used, cell)
-        block = cell_block[cell]
-        _queue_needy(block_near, block_needy, block_cell, cell_needy, cell_stale, stale, stale_used, block)
+        more[to_chunk, to_at] = 0
+        cell[c, COUNT] -= 1
+        if cell[c, COUNT] % CHUNK == 0 and cell[c, COUNT] > 0:
+            cell[c, LAST] = before_last
+        if cell[c, COUNT] == 0:
+            bits[b, FILLED] &= ~(np.uint64(1) << np.uint64(place))
+        _mark_fresh(bits, grid.fresh, grid.used, b, place)
     return removed
 
 
 @njit(cache=True, nogil=True)
-def _queue_needy(block_near, block_needy, block_cell, cell_needy, cell_stale, stale, stale_used, block):
-    """Queue the cells around whose points look farther than their neighbours."""
-    for i in range(27):
-        other = block_near[block, i]
-        if other < 0 or block_needy[other] == 0:
-            continue
-        for place in range(BLOCK_CELLS):
-            cell = block_cell[other, place]
-            if cell >= 0 and cell_needy[cell] != 0 and cell_stale[cell] == 0:
-                cell_stale[cell] = QUEUED
-                stale[stale_used[0]] = cell
-                stale_used[0] += 1
+def mark_all_fresh(grid: Grid) -> None:
+    """Mark every cell that holds points."""
+    bits, fresh, used = grid.bits, grid.fresh, grid.used
+    for b in range(used[BLOCKS]):
+        if bits[b, FRESH] == 0 and bits[b, FILLED] != 0:
+            fresh[used[FRESH_BLOCKS]] = b
+            used[FRESH_BLOCKS] += 1
+        bits[b, FRESH] |= bits[b, FILLED]
 
 
 @njit(cache=True, nogil=True)
-def take_stale(grid: Grid) -> Int32Array:
-    """Empty the queue: the cells to evaluate, each once; a new round begins."""
-    cell_stale = grid.cell_stale
-    cells = grid.stale[: grid.stale_used[0]].copy()
-    for i in range(len(cells)):
-        cell_stale[cells[i]] = 0
-    grid.stale_used[0] = 0
-    grid.round[0] += 1
-    return cells
+def blocks_to_evaluate(grid: Grid) -> Int32Array:
+    """The blocks with cells that something fresh may have reached, and in their NEXT_TO bits which cells these are.
+
+    Cells that look farther are found by whoever evaluates the block; a block that has such is listed when it lies next
+    to a fresh one.
+    """
+    used, block, bits, fresh = grid.used, grid.block, grid.bits, grid.fresh
+    used[EVALUATIONS] += 1
+    listed = np.empty(min(27 * used[FRESH_BLOCKS], used[BLOCKS]), dtype=np.int32)
+    n = 0
+    for i in range(used[FRESH_BLOCKS]):
+        b = np.int64(fresh[i])
+        places = bits[b, FRESH]
+        while places != np.uint64(0):
+            place = lowest_bit(places)
+            places &= places - np.uint64(1)
+            for k in range(AROUND_COUNT[1, place]):
+                other = np.int64(block[b, NEAR + AROUND_NEAR[1, place, k]])
+                if other >= 0:
+                    bits[other, NEXT_TO] |= AROUND_MASK[1, place, k]
+        for near in range(27):
+            other = np.int64(block[b, NEAR + near])
+            if other < 0 or block[other, ROUND] == used[EVALUATIONS]:
+                continue
+            if bits[other, NEXT_TO] | bits[other, FAR] != np.uint64(0):
+                block[other, ROUND] = used[EVALUATIONS]
+                listed[n] = other
+                n += 1
+    return listed[:n]
 
 
 @njit(cache=True, nogil=True)
-def queue_all(grid: Grid) -> None:
-    """Queue every cell."""
-    cell_stale, stale = grid.cell_stale, grid.stale
-    for cell in range(grid.cells_used[0]):
-        cell_stale[cell] = SPREAD
-        stale[cell] = cell
-    grid.stale_used[0] = grid.cells_used[0]
+def forget_fresh(grid: Grid) -> None:
+    """After an evaluation nothing is fresh."""
+    for i in range(grid.used[FRESH_BLOCKS]):
+        grid.bits[grid.fresh[i], FRESH] = 0
+    grid.used[FRESH_BLOCKS] = 0
+
+
+@njit(cache=True, nogil=True)
+def count_points(blocks: Int32Array, grid: Grid) -> int:
+    """How many points the blocks may hold."""
+    bits, block, cell = grid.bits, grid.block, grid.cell
+    count = np.int64(0)
+    for b in blocks:
+        places = bits[b, FILLED]
+        while places != np.uint64(0):
+            count += cell[block[b, CELL + lowest_bit(places)], COUNT]
+            places &= places - np.uint64(1)
+    return count + grid.used[DOUBLES]

@@ -12,6 +12,9 @@ import numpy.typing as npt
 from drivers.scanline import Float64Array, Scanline, read_only
 
 QUANTUM_MM = 2.0**-13
+PER_MM = 2.0**13
+"""Quanta in a millimetre."""
+
 LINE_SPACING_RANGE_MM = (1e-4, 1e3)
 """Scanlines closer or farther apart than this are a mistake in the unit, not a scan."""
 

@@ -31,7 +31,8 @@ class Lines(NamedTuple):
     `laser_q` (L, 3) laser positions in quanta from the origin; `pass_bit` (L,) the bit of the line's pass while that
     is open, else 0; `open_bits` (1,) all of these together. For each of the MAX_OPEN_PASSES: `heading` (., 3) the unit
     normal of its laser planes in the direction of travel, NaN when unknown or not steady, and `front_q` (.,) how far
-    along it the latest plane lies. `laser_box_q` (2, 3) are the lowest and highest laser coordinates of all lines.
+    along it the latest plane lies. `waits` (L,) the bits of the passes that the line's points wait for, 255 when it is
+    not known which, 0 when they wait for none.
     """
 
     laser_q: npt.NDArray[np.float64]
@@ -39,10 +40,10 @@ class Lines(NamedTuple):
     open_bits: UInt8Array
     heading: npt.NDArray[np.float64]
     front_q: npt.NDArray[np.float64]
-    laser_box_q: npt.NDArray[np.float64]
+    waits: UInt8Array
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def radius_limit_mm(base_mm, rules):
     """r_max of a point whose rule gave `base_mm`."""
     if rules.is_flexible:

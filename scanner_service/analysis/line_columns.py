@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.intake import QUANTUM_MM, StoredLine
@@ -17,7 +16,6 @@ _ROW = np.dtype(
         ("pass_number", np.int32),
         ("line_index", np.int64),
         ("point_count", np.int32),
-        ("first_row", np.int32),
         ("laser_mm", np.float64, 3),
         ("plane_normal", np.float64, 3),
         ("travel", np.float64, 3),
@@ -37,8 +35,11 @@ class LineColumns:
         self._rows = np.zeros(256, dtype=_ROW)
         self._laser_q = np.zeros((256, 3))
         self._pass_bit: UInt8Array = np.zeros(256, dtype=np.uint8)
+        self._waits: UInt8Array = np.zeros(256, dtype=np.uint8)
+        self._first_row: Int32Array = np.zeros(257, dtype=np.int32)
+        self._box_q: Int32Array = np.zeros((256, 2, 3), dtype=np.int32)
+        self._clearance_q = np.zeros(256)
         self._used = 0
-        self.laser_box_q = np.array([[np.inf] * 3, [-np.inf] * 3])
         self._table: LineTable | None = None
         self._devices: dict[str, int] = {}
 
@@ -52,13 +53,21 @@ class LineColumns:
         point_spacing_mm: float,
         stationary: bool,
         first_row: int,
+        clearance_mm: float,
         origin_mm: Float64Array,
     ) -> int:
-        """Add a line whose points begin at `first_row`; returns its row."""
+        """Add a line whose points are the rows from `first_row` on; returns its row.
+
+        `clearance_mm` is the least r_max of its points.
+        """
         if self._used == len(self._rows):
             self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
             self._laser_q = np.concatenate([self._laser_q, np.zeros_like(self._laser_q)])
             self._pass_bit = np.concatenate([self._pass_bit, np.zeros_like(self._pass_bit)])
+            self._waits = np.concatenate([self._waits, np.zeros_like(self._waits)])
+            self._first_row = np.concatenate([self._first_row, np.zeros_like(self._first_row[1:])])
+            self._box_q = np.concatenate([self._box_q, np.zeros_like(self._box_q)])
+            self._clearance_q = np.concatenate([self._clearance_q, np.zeros_like(self._clearance_q)])
         row = self._used
         self._rows[row] = (
             self._devices.setdefault(line.device_id, len(self._devices)),
@@ -66,7 +75,6 @@ class LineColumns:
             of.number,
             line.line_index,
             line.point_count,
-            first_row,
             line.laser_mm,
             line.plane_normal,
             line.travel,
@@ -76,11 +84,11 @@ class LineColumns:
             point_spacing_mm,
             stationary,
         )
-        laser_q = (line.laser_mm - origin_mm) / QUANTUM_MM
-        self._laser_q[row] = laser_q
-        self.laser_box_q[0] = np.minimum(self.laser_box_q[0], laser_q)
-        self.laser_box_q[1] = np.maximum(self.laser_box_q[1], laser_q)
+        self._laser_q[row] = (line.laser_mm - origin_mm) / QUANTUM_MM
         self._pass_bit[row] = 1 << of.slot if of.slot >= 0 else 0
+        self._waits[row] = 0
+        self._first_row[row], self._first_row[row + 1] = first_row, first_row + len(line.index)
+        self._clearance_q[row] = clearance_mm / QUANTUM_MM
         self._used = row + 1
         return row
 
@@ -88,22 +96,38 @@ class LineColumns:
         """The lines of a closed pass no longer hold anything open."""
         self._pass_bit[: self._used][self._rows["pass_number"][: self._used] == pass_number] = 0
 
+    def set_clearance(self, clearance_mm: float) -> None:
+        """Every point has another radius now, and this r_max."""
+        self._clearance_q[: self._used] = clearance_mm / QUANTUM_MM
+
     def ranges(self, used: int, pass_number: int | None = None) -> list[tuple[int, int, int]]:
         """(line, first row, end row) of the lines, or of one pass, whose points are among the first `used` rows."""
-        rows = self._rows[: self._used]
-        first = rows["first_row"]
-        end = np.minimum(np.append(first[1:], used), used)
-        chosen = (end > first) if pass_number is None else (end > first) & (rows["pass_number"] == pass_number)
+        first = self._first_row[: self._used]
+        end = np.minimum(self._first_row[1 : self._used + 1], used)
+        chosen = end > first
+        if pass_number is not None:
+            chosen &= self._rows["pass_number"][: self._used] == pass_number
         return [(int(line), int(first[line]), int(end[line])) for line in np.flatnonzero(chosen)]
 
-    def line_of(self, rows: Int32Array) -> Int32Array:
-        """(m,) line of each row of points."""
-        found = np.searchsorted(self._rows["first_row"][: self._used], rows, side="right") - 1
-        return found.astype(np.int32)
+    def box_q(self, line: int) -> Int32Array:
+        """The box (2, 3) of a line's points, to be filled by whoever writes them."""
+        return self._box_q[line]
 
-    def kernel_columns(self) -> tuple[npt.NDArray[np.float64], UInt8Array]:
-        """Laser positions (L, 3) in quanta from the origin and pass bits (L,), as views."""
-        return self._laser_q[: self._used], self._pass_bit[: self._used]
+    def laser_q(self, line: int) -> Float64Array:
+        """Laser position (3,) of a line in quanta from the origin."""
+        return self._laser_q[line]
+
+    def kernel_columns(self) -> tuple[Float64Array, UInt8Array, UInt8Array]:
+        """Laser positions (L, 3) in quanta from the origin, pass bits (L,) and what lines wait for, as views.
+
+        The last is as long as what is reserved, which is a multiple of 8.
+        """
+        return self._laser_q[: self._used], self._pass_bit[: self._used], self._waits
+
+    def extents(self) -> tuple[Int32Array, Int32Array, Float64Array]:
+        """Where rows begin (L + 1,), boxes of the points (L, 2, 3) and least r_max (L,) in quanta, as views."""
+        used = self._used
+        return self._first_row[: used + 1], self._box_q[:used], self._clearance_q[:used]
 
     def table(self) -> LineTable:
         """A copy of all rows, made once for as many as there are."""
@@ -116,6 +140,6 @@ class LineColumns:
 
         self._table = LineTable(
             device_ids=tuple(self._devices),
-            **{name: column(name) for name in _ROW.names or () if name != "first_row"},
+            **{name: column(name) for name in _ROW.names or ()},
         )
         return self._table

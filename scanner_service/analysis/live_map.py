@@ -18,31 +18,42 @@ from scanner_service.analysis.change_log import ChangeLog
 from scanner_service.analysis.describing import describe
 from scanner_service.analysis.errors import MapFull
 from scanner_service.analysis.flexible import flexible_radii_mm
+from scanner_service.analysis.gathering import reserve_scratch
 from scanner_service.analysis.global_radius import GlobalRadius
 from scanner_service.analysis.grid import (
-    SMALLEST_SIDE_Q,
+    BLOCKS,
+    blocks_to_evaluate,
+    cell_side_q,
+    count_points,
+    forget_fresh,
     insert_points,
-    queue_all,
+    mark_all_fresh,
     remove_points,
     reserve_grid,
-    take_stale,
 )
 from scanner_service.analysis.intake import QUANTUM_MM, StoredLine
-from scanner_service.analysis.kernel_rules import Lines, Rules
+from scanner_service.analysis.kernel_rules import Lines, Rules, radius_limit_mm
 from scanner_service.analysis.line_columns import LineColumns
-from scanner_service.analysis.neighbourhood import evaluate_cells
+from scanner_service.analysis.neighbourhood import evaluate_blocks
 from scanner_service.analysis.passes import Pass, PassBook, PassKey
 from scanner_service.analysis.points import (
     GROWTH_REACH,
-    LISTED,
     NOT_COUNTED,
     PointArray,
     reserve_points,
     write_points,
 )
 from scanner_service.analysis.radius import RadiusSettings, line_radius, point_spacing_mm
-from scanner_service.analysis.settling import drop_pass, list_unsettled, settle_listed
+from scanner_service.analysis.settling import drop_pass, settle_lines
 from scanner_service.analysis.snapshot import Int32Array, MapSnapshot, RadiusRule, Unreliable
+
+_SHARED_BLOCKS = 600
+"""Fewer blocks than this, what some lines touch, are evaluated sooner by the calling thread alone."""
+
+_PARTS_A_THREAD = 8
+
+_KEPT_CHANGES = 500_000
+"""Changed rows are remembered for half as many rows as the map has, and at least this many."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +110,7 @@ class LiveMap:
         self.origin_mm = np.zeros(3) if origin_mm is None else np.array(origin_mm, dtype=np.float64)
         self.version = 0
         self._points: PointArray = reserve_points(self.settings.max_points)
+        self._place: Int32Array = np.empty(self.settings.max_points, dtype=np.int32)
         self._used = 0
         self._first_new = 0  # rows from here on were never evaluated
         self._grid = reserve_grid(1, 1)
@@ -106,8 +118,7 @@ class LiveMap:
         self._largest_radius_mm = 0.0
         self._lines = LineColumns()
         self._passes = PassBook()
-        self._listed: Int32Array = np.empty(self.settings.max_points, dtype=np.int32)
-        self._listed_used = 0
+        self._scratch = [reserve_scratch(self.settings.cell_limit) for _ in range(self.settings.threads)]
         self._pending: list[Int32Array] = []
         self._changes = ChangeLog()
         self._rules = Rules(
@@ -170,10 +181,12 @@ class LiveMap:
         stationary = of.slot >= 0 and of.stands_still_at(line)
         passed_over = "withdrawn" if of.is_withdrawn else "stationary" if stationary else None
         first, last = self._used, self._used + len(line.index)
-        row = self._lines.append(line, of, spacing, stationary, first, self.origin_mm)
-        said = Unreliable.TOO_FEW if passed_over is None else Unreliable.NOT_COUNTED
         radii = np.array([common]) if radius_mm is None else np.ascontiguousarray(radius_mm, dtype=np.float64)
-        write_points(self._points, first, line.xyz_q, line.index, radii, int(rule), int(said))
+        clearance_mm = float(radius_limit_mm(radii.min(initial=common), self._rules))
+        row = self._lines.append(line, of, spacing, stationary, first, clearance_mm, self.origin_mm)
+        said = Unreliable.TOO_FEW if passed_over is None else Unreliable.NOT_COUNTED
+        write_points(self._points, first, line.xyz_q, row, radii, int(rule), int(said), self._lines.box_q(row))
+        self._place[first:last] = line.index
         self._used = last
         if passed_over is not None:
             self._grid_rows = last
@@ -195,7 +208,10 @@ class LiveMap:
         closed = self._passes.close(key)
         if closed is None:
             return
-        drop_pass(self._listed[: self._listed_used], self._points, 1 << closed.slot)
+        settled = np.empty(self._used, dtype=np.int32)
+        first_row, _, _ = self._lines.extents()
+        done = drop_pass(first_row, self._points, self._line_state().waits, 1 << closed.slot, settled)
+        self._pending.append(settled[:done].copy())
         self._lines.drop_pass(closed.number)
 
     def withdraw_pass(self, key: PassKey) -> int:
@@ -234,7 +250,7 @@ class LiveMap:
                 f"the live map is configured for {self.settings.max_points} points and holds {self._used}: "
                 f"{more} more do not fit; raise max_points or start another session"
             )
-        if self._grid_rows and int(self._grid.blocks_used[0]) + more > len(self._grid.block_key):
+        if self._grid_rows and int(self._grid.used[BLOCKS]) + more > len(self._grid.block):
             raise MapFull(
                 "the live map has no room for another line: the points are scattered too widely for "
                 f"{self.settings.max_points} max_points; raise it or start another session"
@@ -243,7 +259,7 @@ class LiveMap:
     def _follow(self, of: Pass, line: StoredLine) -> None:
         """Advance the front of a pass; when it stops being steady, all it ever reached waits again."""
         if of.advance(line):
-            queue_all(self._grid)
+            mark_all_fresh(self._grid)
             self._first_new = 0
         self._passes.publish(of, self.origin_mm)
 
@@ -251,14 +267,13 @@ class LiveMap:
         """Make the cells at least as large as the largest radius, building the grid again when they are not."""
         if radius_mm <= self._largest_radius_mm:
             return
-        if radius_mm <= self._grid.side_q[0] * QUANTUM_MM:
+        if cell_side_q(radius_mm, QUANTUM_MM) <= self._grid.side_q[0]:
             self._largest_radius_mm = radius_mm
             return
         # Radii that creep up line by line must not build the grid anew each time.
         side_mm = radius_mm if self._largest_radius_mm == 0.0 else 1.25 * radius_mm
-        side_q = max(math.ceil(side_mm / QUANTUM_MM), SMALLEST_SIDE_Q)
         self._largest_radius_mm = radius_mm
-        self._build_grid(side_q)
+        self._build_grid(cell_side_q(side_mm, QUANTUM_MM))
 
     def _build_grid(self, side_q: int) -> None:
         """Build the grid anew with cells of this side; every point is evaluated again with the next reading."""
@@ -273,7 +288,9 @@ class LiveMap:
         said = self._points["unreliable"][first:last]
         counted = (said != NOT_COUNTED).astype(np.uint8)
         wanted = int(counted.sum())
-        taken = insert_points(self._grid, self._points, first, line, self.settings.cell_limit, counted)
+        laser_q = self._lines.laser_q(line)
+        shares = self.settings.radius.rule == "line"  # the others count points, and entries would be too few
+        taken = insert_points(self._grid, self._points, first, line, laser_q, self.settings.cell_limit, shares, counted)
         if taken < last - first:
             raise MapFull("the live map has no cells left: the points are scattered too widely for max_points")
         self._grid_rows = last
@@ -289,16 +306,17 @@ class LiveMap:
         rows = self._global.sample()
         rows = rows[self._points["unreliable"][rows] != NOT_COUNTED]
         radii = np.empty(len(rows))
-        flexible_radii_mm(rows, self._grid, self._points, self._rules, radii)
+        flexible_radii_mm(rows, self._grid, self._points, self._rules, self._scratch[0], radii)
         radius_mm = self._global.settle_on(radii, self._used)
         if radius_mm is None:
             return
         self._points["radius_mm"][: self._used] = radius_mm
         self._points["rule"][: self._used] = RadiusRule.GLOBAL
         self._points["changed_at"][: self._used] = 0  # another radius is another answer, whatever it counts
+        self._lines.set_clearance(float(radius_limit_mm(radius_mm, self._rules)))
         self._largest_radius_mm = radius_mm
         side_mm = max(radius_mm, self._rules.max_radius_mm / GROWTH_REACH)
-        self._build_grid(max(math.ceil(side_mm / QUANTUM_MM), SMALLEST_SIDE_Q))
+        self._build_grid(cell_side_q(side_mm, QUANTUM_MM))
 
     def _leave_out(self, rows: npt.NDArray[np.int64]) -> None:
         """Keep rows without counting them, and without an answer."""
@@ -307,7 +325,7 @@ class LiveMap:
             self._points[name][rows] = 0
         for name in ("nx", "ny", "nz", "middle_mm2", "smallest_mm2", "offset_sq"):
             self._points[name][rows] = np.nan
-        self._points["open_passes"][rows] &= LISTED
+        self._points["open_passes"][rows] = 0
         self._pending.append(rows.astype(np.int32))
 
     # -- reading ------------------------------------------------------------------------------------------------
@@ -319,26 +337,20 @@ class LiveMap:
     def refresh(self) -> Int32Array:
         """Evaluate what the lines since the last call reach; returns the rows (m,) whose answer changed, each once."""
         version = self.version + 1
-        stale = take_stale(self._grid)
-        changed = self._evaluate(stale, version) if len(stale) else []
+        blocks = blocks_to_evaluate(self._grid)
+        changed = self._evaluate(blocks, version) if len(blocks) else []
+        forget_fresh(self._grid)
         self._first_new = self._used
         if self._pending:
             pending = np.unique(np.concatenate(self._pending))
             changed.append(pending[self._points["changed_at"][pending] != version])
             self._points["changed_at"][pending] = version
             self._pending.clear()
-        for rows in changed:
-            self._listed_used = int(list_unsettled(rows, self._points, self._listed, self._listed_used))
-        settled = np.empty(self._listed_used, dtype=np.int32)
-        waiting, done = settle_listed(
-            self._listed[: self._listed_used], self._points, self._line_state(), self._rules, version, settled
-        )
-        self._listed_used = int(waiting)
-        changed.append(settled[:done])
+        changed.append(self._settle(version))
         rows = np.concatenate(changed)
         if len(rows):
             self.version = version
-            self._changes.append(version, rows, keep_rows=2 * self._used)
+            self._changes.append(version, rows, keep_rows=max(self._used // 2, _KEPT_CHANGES))
         return rows
 
     def read_version(self) -> int:
@@ -361,33 +373,42 @@ class LiveMap:
             self._points[rows],
             version=self.version,
             origin_mm=self.origin_mm,
-            line=self._lines.line_of(rows),
+            place=self._place[rows],
             lines=self._lines.table(),
             noise_mm=self.settings.noise_mm,
             max_radius_mm=self._rules.max_radius_mm,
         )
 
     def _line_state(self) -> Lines:
-        laser_q, pass_bit = self._lines.kernel_columns()
+        laser_q, pass_bit, waits = self._lines.kernel_columns()
         passes = self._passes
-        return Lines(laser_q, pass_bit, passes.open_bits, passes.heading, passes.front_q, self._lines.laser_box_q)
+        return Lines(laser_q, pass_bit, passes.open_bits, passes.heading, passes.front_q, waits)
+
+    def _settle(self, version: int) -> Int32Array:
+        """Let the points settle that the passes have left behind; the rows of those that nothing else changed."""
+        extents = self._lines.extents()
+        settled = np.empty(self._used, dtype=np.int32)
+        done = settle_lines(*extents, self._points, self._line_state(), self._rules, version, settled)
+        return settled[:done].copy()
 
     def _max_radius_mm(self) -> float:
         limit = self.settings.max_radius_mm
         return 20.0 * self.settings.radius.uncertainty_mm if limit is None else limit
 
-    def _evaluate(self, stale: Int32Array, version: int) -> list[Int32Array]:
-        """Evaluate cells, split among the map's threads; every point belongs to one cell, so none is written twice."""
+    def _evaluate(self, blocks: Int32Array, version: int) -> list[Int32Array]:
+        """Evaluate blocks, split among the threads; every point belongs to one block, so none is written twice."""
         lines = self._line_state()
 
-        def work(cells: Int32Array) -> Int32Array:
-            changed = np.empty(int(self._grid.cell_count[cells].sum()), dtype=np.int32)
-            count = evaluate_cells(
-                cells, self._grid, self._points, lines, self._rules, version, self._first_new, changed
+        def work(part: Int32Array) -> Int32Array:
+            scratch = self._scratch.pop()
+            changed = np.empty(count_points(part, self._grid), dtype=np.int32)
+            count = evaluate_blocks(
+                part, self._grid, self._points, lines, self._rules, version, self._first_new, scratch, changed
             )
+            self._scratch.append(scratch)
             return changed[:count]
 
-        if self._pool is None or len(stale) < 256:
-            return [work(stale)]
-        parts: Iterable[Int32Array] = np.array_split(stale, self.settings.threads)
+        if self._pool is None or len(blocks) < _SHARED_BLOCKS:
+            return [work(blocks)]
+        parts: Iterable[Int32Array] = np.array_split(blocks, _PARTS_A_THREAD * self.settings.threads)
         return list(self._pool.map(work, parts))

@@ -138,3 +138,19 @@ def fit_planes(sums: npt.NDArray[np.float64], n: int, fits: npt.NDArray[np.float
         fits[3, i], fits[4, i], fits[5, i] = large * scale, middle * scale, small * scale
         fits[6, i] = 1.0 if has_arrived and uu > 1e-60 else 0.0
         fits[7, i] = (x * x + y * y + z * z) * per * per
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit_column(sums: npt.NDArray[np.float64], fits: npt.NDArray[np.float64], i: int) -> None:
+    """Fit the plane of one column, of `fit_planes`, by the solver that always arrives."""
+    per = 1.0 / max(sums[0, i], 1.0)
+    x, y, z = sums[4, i], sums[5, i], sums[6, i]
+    fits[0, i], fits[1, i], fits[2, i], fits[3, i], fits[4, i], fits[5, i] = smallest_axis(
+        sums[7, i] - x * x * per,
+        sums[8, i] - x * y * per,
+        sums[9, i] - x * z * per,
+        sums[10, i] - y * y * per,
+        sums[11, i] - y * z * per,
+        sums[12, i] - z * z * per,
+    )
+    fits[7, i] = (x * x + y * y + z * z) * per * per

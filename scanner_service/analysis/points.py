@@ -15,7 +15,7 @@ POINT = np.dtype(
         ("z", np.int32),
         ("other_side", np.int32),  # neighbours whose own ray comes from the other side of the plane
         ("radius_mm", np.float64),  # what the rule gave, before growing
-        ("place", np.int32),  # place in the line
+        ("line", np.int32),  # row of its scanline
         ("neighbours", np.int32),  # Np, the point itself counted; 0: not counted
         ("nx", np.float32),  # unit normal towards the laser; NaN: unreliable
         ("ny", np.float32),
@@ -27,7 +27,7 @@ POINT = np.dtype(
         ("rule", np.uint8),  # RadiusRule
         ("growth", np.uint8),  # how many steps the radius has grown
         ("unreliable", np.uint8),  # Unreliable
-        ("open_passes", np.uint8),  # a bit for every open pass that reaches the point; LISTED: in the unsettled list
+        ("open_passes", np.uint8),  # a bit for every open pass that reaches the point
     ]
 )
 assert POINT.itemsize == 64  # one cache line
@@ -35,7 +35,7 @@ assert POINT.itemsize == 64  # one cache line
 PointArray = npt.NDArray[Any]
 
 MAX_OPEN_PASSES = 7
-LISTED = 128
+_CACHE_LINE = 64
 
 GROWTH = 1.25
 """A radius grows by this factor a step."""
@@ -45,8 +45,10 @@ GROWTH_REACH = 4.0
 
 
 def reserve_points(max_points: int) -> PointArray:
-    """Room for `max_points` points; pages of memory come into being when they are first touched."""
-    return np.empty(max_points, dtype=POINT)
+    """Room for `max_points` points, each in a cache line of its own; memory comes into being as it is touched."""
+    room = np.empty((max_points + 1) * _CACHE_LINE, dtype=np.uint8)
+    skipped = -room.ctypes.data % _CACHE_LINE
+    return room[skipped : skipped + max_points * _CACHE_LINE].view(POINT)
 
 
 def used_radius_mm(points: PointArray, max_radius_mm: float) -> npt.NDArray[np.float64]:
@@ -62,27 +64,33 @@ def write_points(
     points: PointArray,
     first: int,
     xyz_q: Int32Array,
-    place: Int32Array,
+    line: int,
     radius_mm: npt.NDArray[np.float64],
     rule: int,
     unreliable: int,
+    box_q: Int32Array,
 ) -> None:
     """Write what came in with a scanline, and what is said of a point before it was ever evaluated.
 
-    `radius_mm` (k,) or (1,), one for all.
+    `radius_mm` (k,) or (1,), one for all. The lowest and highest coordinates go to `box_q` (2, 3).
     """
     nothing = np.float32(np.nan)
-    for i in range(len(place)):
+    box_q[0] = 2**31 - 1
+    box_q[1] = -(2**31)
+    for i in range(len(xyz_q)):
         point = points[first + i]
         point.x, point.y, point.z = xyz_q[i, 0], xyz_q[i, 1], xyz_q[i, 2]
         point.other_side = 0
-        point.place = place[i]
+        point.line = line
         point.radius_mm = radius_mm[i] if len(radius_mm) > 1 else radius_mm[0]
         point.neighbours = 0
         point.nx, point.ny, point.nz = nothing, nothing, nothing
         point.middle_mm2, point.smallest_mm2, point.offset_sq = nothing, nothing, nothing
         point.changed_at = 0
         point.rule, point.growth, point.unreliable, point.open_passes = rule, 0, unreliable, 0
+        for axis in range(3):
+            box_q[0, axis] = min(box_q[0, axis], xyz_q[i, axis])
+            box_q[1, axis] = max(box_q[1, axis], xyz_q[i, axis])
 
 
 NOT_COUNTED = int(Unreliable.NOT_COUNTED)

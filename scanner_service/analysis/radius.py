@@ -51,26 +51,27 @@ def point_spacing_mm(xyz_q: npt.NDArray[np.int32], index: npt.NDArray[np.int32])
 
     `xyz_q` (k, 3) are stored coordinates, `index` (k,) their places; pairs with a dropout between them do not count.
     """
-    return float(_median_step(xyz_q, index)) * QUANTUM_MM
+    squares = np.empty(max(len(index) - 1, 0))
+    n = _squared_steps(xyz_q, index, squares)
+    if n < MIN_GAPS:
+        return math.nan
+    half = np.partition(squares[:n], n // 2)
+    upper = math.sqrt(half[n // 2])
+    if n % 2 == 1:
+        return upper * QUANTUM_MM
+    return 0.5 * (math.sqrt(half[: n // 2].max()) + upper) * QUANTUM_MM
 
 
 @njit(cache=True, nogil=True)
-def _median_step(xyz_q: npt.NDArray[np.int32], place: npt.NDArray[np.int32]) -> float:
-    """The same in quanta; squares of steps are exact in float64 up to 8 m."""
-    squares = np.empty(max(len(place) - 1, 0))
+def _squared_steps(xyz_q: npt.NDArray[np.int32], place: npt.NDArray[np.int32], squares: npt.NDArray[np.float64]) -> int:
+    """Squared distances of neighbours in quanta, exact in float64 up to 8 m; returns how many there are."""
     n = 0
     for i in range(len(place) - 1):
         if place[i + 1] - place[i] == 1:
             x, y, z = xyz_q[i + 1, 0] - xyz_q[i, 0], xyz_q[i + 1, 1] - xyz_q[i, 1], xyz_q[i + 1, 2] - xyz_q[i, 2]
             squares[n] = float(x) * x + float(y) * y + float(z) * z
             n += 1
-    if n < MIN_GAPS:
-        return np.nan
-    half = np.partition(squares[:n], n // 2)
-    upper = math.sqrt(half[n // 2])
-    if n % 2 == 1:
-        return upper
-    return 0.5 * (math.sqrt(half[: n // 2].max()) + upper)
+    return n
 
 
 def line_radius(line_spacing_mm: float, measured_mm: float, settings: RadiusSettings) -> tuple[float, RadiusRule]:

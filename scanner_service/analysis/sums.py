@@ -15,25 +15,31 @@ EXACT_LINES = 2**19
 """Up to this many scanlines the sums that tell one line from several are, too."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def put(sums, column, values):
     """Write the thirteen sums of a point into a column."""
     for i in range(13):
         sums[i, column] = values[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def is_in_floats(count, reach, is_exact):
+    """True when the sums over so many neighbours are exact in float64; else the integers' sums are taken."""
+    return is_exact and count * reach < _EXACT
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def sums_within(points, row, own, local, n, reach, is_exact):
     """The sums of `_sums`, exact for any radius."""
     px, py, pz = points[row].x, points[row].y, points[row].z
     if is_exact:
         sums = _sums(local, n, float(px), float(py), float(pz), float(own), float(reach))
-        if sums[0] * reach < _EXACT:
+        if is_in_floats(sums[0], reach, is_exact):
             return sums
     return _sums_of_integers(local, n, px, py, pz, own, reach)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "nnan", "contract"})
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True, fastmath={"reassoc", "nsz", "nnan", "contract"})
 def _sums(local, n, px, py, pz, own, reach):
     """Counts and moments of the candidates within reach, without a branch, for vector registers.
 
