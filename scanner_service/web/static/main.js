@@ -36,7 +36,7 @@ const marker = element("div.marker", { hidden: true, "aria-hidden": "true" });
 byId("view").append(marker);
 view.scene.add(cloud.object, overlay.group);
 
-const passes = new PassesPanel(trouble);
+const passes = new PassesPanel(trouble, () => session.open(session.id));
 const picker = new SessionPicker({ onChoose: openSession, onMissing: (text) => notice(text), current: () => session.id });
 
 function openView() {

@@ -9,9 +9,12 @@ const unit = (text) => element("span.unit", {}, text);
 export class PassesPanel {
   #id = null;
   #asked = 0;
+  #said = null; // how far the orders were when last heard of
 
-  constructor(trouble) {
+  // scanned: a pass has begun or ended, so the session's points are flowing again, or have changed
+  constructor(trouble, scanned) {
     this.trouble = trouble;
+    this.scanned = scanned;
     byId("find-passes").addEventListener("click", () => this.refresh());
     byId("run-loop").addEventListener("click", () => this.#act(() => startLoop(this.#id)));
     byId("end-loop").addEventListener("click", () => this.#act(() => endLoop(this.#id)));
@@ -19,6 +22,7 @@ export class PassesPanel {
 
   open(id) {
     this.#id = id;
+    this.#said = null;
     byId("passes").replaceChildren(element("li.empty", {}, "Not asked for yet."));
     byId("orders").replaceChildren();
     byId("passes-count").textContent = "";
@@ -33,6 +37,9 @@ export class PassesPanel {
       const [plan, { orders }, { loop }] = [await listPasses(id), await listOrders(id), await loopState(id)];
       if (id !== this.#id || asked !== this.#asked) return;
       this.#draw(plan, orders, loop);
+      const said = orders.filter((order) => order.status !== "accepted").map((order) => order.order + order.status).join();
+      if (this.#said !== null && said !== this.#said) this.scanned();
+      this.#said = said;
       if (loop?.running || orders.some((order) => order.status === "running")) setTimeout(() => this.refresh(), 1000);
     } catch (refusal) {
       this.trouble(refusal.message);
