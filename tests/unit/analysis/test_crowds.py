@@ -23,7 +23,12 @@ def agree(snapshot, rows, live):
     counted = snapshot.unreliable != Unreliable.NOT_COUNTED
     xyz_q = np.rint((snapshot.points_mm - snapshot.origin_mm) * 8192).astype(np.int64)
     oracle = Oracle(
-        xyz_q, snapshot.radius_mm, snapshot.line, snapshot.lines.laser_mm[snapshot.line], live.settings.noise_mm, counted
+        xyz_q,
+        snapshot.radius_mm,
+        snapshot.line,
+        snapshot.lines.laser_mm[snapshot.line],
+        live.settings.noise_mm,
+        counted,
     )
     for row in rows:
         answer = oracle.at(row)
