@@ -21,6 +21,7 @@ MAX_CELLS = 6_000_000
 MAX_OPEN = 200_000
 LEAST_CELL_MM = 0.5
 _LINES_IN_A_CELL = 1.3  # so that a surface at the coarsest line spacing leaves no cell empty
+_ONE_SIDED = 0.6  # length of the mean normal below which the normals of a cell point both ways
 _MARGIN_MM = 1.5  # how far beyond the outermost points hidden surface is reckoned with: the next pass sees further
 
 
@@ -30,8 +31,8 @@ class KnownSurface:
 
     `state` (i, j, k) is UNTOUCHED, FREE, HIDDEN or SURFACE as in `marching`. One row a cell with points:
     `points_mm`, `normals` (m, 3; unit, towards the laser), `area_mm2`, `count`, `failing_share` (m,) and `region` (m,),
-    the number that failing points gave (0: none). `frontier_mm`, `frontier_normals` (f, 3) and `frontier_mm2` (f,) are
-    where hidden space begins: surface that no point has touched may be there.
+    the number that failing points gave (0: none); `two_sided` (m,) where both sides of a thin wall were seen.
+    `frontier_mm`, `frontier_normals` (f, 3) and `frontier_mm2` (f,) are where hidden space begins: surface that no point has touched may be there.
     """
 
     low_mm: Float64Array
@@ -43,6 +44,7 @@ class KnownSurface:
     count: IntArray
     failing_share: Float64Array
     region: IntArray
+    two_sided: BoolArray
     frontier_mm: Float64Array
     frontier_normals: Float64Array
     frontier_mm2: Float64Array
@@ -50,7 +52,14 @@ class KnownSurface:
     def __post_init__(self) -> None:
         for array in (self.low_mm, self.state, self.points_mm, self.normals, self.area_mm2, self.count):
             read_only(array)
-        for array in (self.failing_share, self.region, self.frontier_mm, self.frontier_normals, self.frontier_mm2):
+        for array in (
+            self.failing_share,
+            self.region,
+            self.two_sided,
+            self.frontier_mm,
+            self.frontier_normals,
+            self.frontier_mm2,
+        ):
             read_only(array)
 
     def keys(self, places_mm: Float64Array) -> IntArray:
@@ -89,7 +98,7 @@ def know_surface(
     low = low - margin
     shape = tuple(math.ceil(float(extent) / side) + 1 for extent in high + margin - low)
     index = np.full(shape, -1, dtype=np.int32)
-    sums = np.zeros((min(int(use.sum()), int(np.prod(shape))), 9))
+    sums = np.zeros((min(int(use.sum()), int(np.prod(shape))), 10))
     bits = np.zeros(len(sums), dtype=np.uint64)
     first = np.zeros(len(points), dtype=np.bool_)
     lines = snapshot.lines
@@ -118,6 +127,7 @@ def know_surface(
         count=sums[:, 6].astype(np.int64),
         failing_share=sums[:, 7] / sums[:, 6],
         region=sums[:, 8].astype(np.int64),
+        two_sided=np.linalg.norm(sums[:, 3:6], axis=1) < _ONE_SIDED * sums[:, 9],
         frontier_mm=low + (open_cells + 0.5) * side,
         frontier_normals=gradient,
         frontier_mm2=side * side / np.maximum(np.abs(gradient).max(axis=1, initial=0.5), 0.5),
@@ -174,5 +184,5 @@ def _nothing() -> KnownSurface:
     whole = np.zeros(0, dtype=np.int64)
     return KnownSurface(
         np.zeros(3), LEAST_CELL_MM, np.zeros((1, 1, 1), dtype=np.uint8), none, none.copy(), flat, whole, flat.copy(),
-        whole.copy(), none.copy(), none.copy(), flat.copy(),
+        whole.copy(), np.zeros(0, dtype=np.bool_), none.copy(), none.copy(), flat.copy(),
     )  # fmt: skip

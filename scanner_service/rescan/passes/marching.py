@@ -70,9 +70,10 @@ def _mark(state, low, cell, x, y, z, dx, dy, dz, start, end, mark):
 def gather(points, use, line, pass_number, normals, fails, region, low, cell, index, sums, first, pass_bits):
     """Add up the points of each cell.
 
-    `index` (the grid's shape) numbers the cells in the order in which they are met, -1 = none; `sums` (cells, 9) are
-    x, y, z, normal's x, y, z, points, failing points, the number of a region (0: none). `first` (n,) is True for the
-    first point that a pass has in a cell; `pass_bits` (cells,) remembers the passes. Returns the number of cells.
+    `index` (the grid's shape) numbers the cells in the order in which they are met, -1 = none; `sums` (cells, 10) are
+    x, y, z, normal's x, y, z, points, failing points, the number of a region (0: none), points with a normal. `first`
+    (n,) is True for the first point that a pass has in a cell; `pass_bits` (cells,) remembers the passes. Returns the
+    number of cells.
     """
     count = 0
     for row in range(len(points)):
@@ -96,6 +97,7 @@ def gather(points, use, line, pass_number, normals, fails, region, low, cell, in
             sums[at, 3] += normals[row, 0]
             sums[at, 4] += normals[row, 1]
             sums[at, 5] += normals[row, 2]
+            sums[at, 9] += 1.0
         sums[at, 6] += 1.0
         if fails[row]:
             sums[at, 7] += 1.0

@@ -11,8 +11,10 @@ from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.gaps import GapKind
 from scanner_service.rescan.passes.known_surface import IntArray, KnownSurface
+from scanner_service.rescan.passes.marching import FREE
 from scanner_service.rescan.regions import RegionReport
 
+_OTHER_SIDE = -0.5  # cosine between normals beyond which two places are the two sides of a wall
 UNSEEN = 0
 """The region number of surface that no point has touched, and that no region has found."""
 
@@ -86,9 +88,9 @@ def find_needs(
     """
     parts = [_measured(surface), _floors(snapshot, report, surface)]
     if explore:
-        parts.append(_frontier(surface))
+        parts += [_frontier(surface), _backs(surface)]
     places, normals, area, region, evidence = (np.concatenate(column) for column in zip(*parts, strict=True))
-    keep = _apart(surface, places, evidence)
+    keep = _apart(surface, places, normals, evidence)
     chance = np.array([(chances or {}).get(kind, 1.0) for kind in Evidence])[evidence]
     needs = Needs(places, normals, area, region, evidence, np.full(len(area), required_per_mm2), chance)
     return needs.only(keep)
@@ -144,13 +146,28 @@ def _frontier(surface: KnownSurface) -> Columns:
     return surface.frontier_mm, surface.frontier_normals, surface.frontier_mm2, none, kind
 
 
-def _apart(surface: KnownSurface, places: Float64Array, evidence: IntArray) -> BoolArray:
+def _backs(surface: KnownSurface) -> Columns:
+    """The other side of walls thinner than a cell: seen from one side only, and known to be free behind."""
+    rows = np.flatnonzero(~surface.two_sided & (surface.failing_share < 0.5))
+    alone = np.ones(len(rows), dtype=np.bool_)
+    for cells in (2.0, 2.8):
+        behind = surface.points_mm[rows] - cells * surface.cell_mm * surface.normals[rows]
+        alone &= surface.state.reshape(-1)[surface.keys(behind)] == FREE
+    rows = rows[alone]
+    kind = np.full(len(rows), Evidence.FRONTIER, dtype=np.int64)
+    none = np.full(len(rows), UNSEEN, dtype=np.int64)
+    return surface.points_mm[rows], -surface.normals[rows], surface.area_mm2[rows], none, kind
+
+
+def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, evidence: IntArray) -> BoolArray:
     """False for guesses that stand on what is known already: measured surface, or a better guess."""
     keep = np.ones(len(places), dtype=np.bool_)
     guessed = np.flatnonzero(evidence != Evidence.MEASURED)
     if len(guessed) and len(surface.points_mm):
-        near, _ = cKDTree(surface.points_mm).query(places[guessed], distance_upper_bound=1.2 * surface.cell_mm)
-        keep[guessed] = ~np.isfinite(near)
+        near, which = cKDTree(surface.points_mm).query(places[guessed], distance_upper_bound=1.2 * surface.cell_mm)
+        met = np.minimum(which, len(surface.points_mm) - 1)
+        facing = np.einsum("ij,ij->i", surface.normals[met], normals[guessed])
+        keep[guessed] = ~np.isfinite(near) | ((facing < _OTHER_SIDE) & ~surface.two_sided[met])
     floors = np.flatnonzero((evidence == Evidence.FLOOR) & keep)
     frontier = np.flatnonzero((evidence == Evidence.FRONTIER) & keep)
     if len(floors) and len(frontier):

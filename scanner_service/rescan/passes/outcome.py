@@ -73,23 +73,27 @@ def reckon(
 ) -> Outcome:
     """Compare the map before and after a pass.
 
-    Good surface is a cell less than half of whose points fail. What is good after the pass and lies near no cell that
-    was good before is reached; it is given to the region of the nearest place that was to be served.
+    Good surface is a cell less than half of whose points fail, each side of a thin wall for itself. What is good after
+    the pass and lies near no cell that was good before is reached; it is given to the region of the
+    nearest place that was to be served.
     """
     old = know_surface(before, *failing_points(before_report), cell_mm)
     new = know_surface(after, *failing_points(after_report), cell_mm)
-    old_good, _ = _good(old)
-    new_good, new_mm2 = _good(new)
+    old_good, old_normals, _ = _good(old)
+    new_good, new_normals, new_mm2 = _good(new)
     fresh = np.ones(len(new_good), dtype=np.bool_)
+    cell = new.cell_mm
     if len(old_good) and len(new_good):
-        near, _ = cKDTree(old_good).query(new_good, distance_upper_bound=_SAME * new.cell_mm)
+        tree = cKDTree(_facing(old_good, old_normals, 0.5 * cell))
+        near, _ = tree.query(_facing(new_good, new_normals, 0.5 * cell), distance_upper_bound=_SAME * cell)
         fresh = ~np.isfinite(near)
     owner = np.full(len(new_good), UNSEEN, dtype=np.int64)
     missed = np.ones(len(done.places_mm), dtype=np.bool_)
     if len(done.places_mm) and len(new_good):
         away, which = cKDTree(done.places_mm).query(new_good)
-        owner = np.where(away <= _BESIDE * new.cell_mm, done.place_regions[np.minimum(which, len(missed) - 1)], UNSEEN)
-        near, _ = cKDTree(new_good).query(done.places_mm, distance_upper_bound=1.2 * new.cell_mm)
+        owner = np.where(away <= _BESIDE * cell, done.place_regions[np.minimum(which, len(missed) - 1)], UNSEEN)
+        tree = cKDTree(_facing(new_good, new_normals, 0.8 * cell))
+        near, _ = tree.query(_facing(done.places_mm, done.place_normals, 0.8 * cell), distance_upper_bound=1.2 * cell)
         missed = ~np.isfinite(near)
     regions = []
     for region in np.unique(np.concatenate([done.place_regions, owner[fresh]])):
@@ -116,7 +120,15 @@ def trust_of(earlier: Sequence[tuple[float, float, float]]) -> float:
     return float(np.clip(np.median(ratios[-_RECENT:]), *_TRUST))
 
 
-def _good(surface: KnownSurface) -> tuple[Float64Array, Float64Array]:
-    """Places and areas of the cells that meet the requirement."""
+def _good(surface: KnownSurface) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Places, normals and areas of the cells that meet the requirement; a wall seen from both sides counts twice."""
     good = surface.failing_share < 0.5
-    return surface.points_mm[good], surface.area_mm2[good]
+    both = good & surface.two_sided
+    places = np.concatenate([surface.points_mm[good], surface.points_mm[both]])
+    normals = np.concatenate([surface.normals[good], -surface.normals[both]])
+    return places, normals, np.concatenate([surface.area_mm2[good], surface.area_mm2[both]])
+
+
+def _facing(places_mm: Float64Array, normals: Float64Array, weight_mm: float) -> Float64Array:
+    """(n, 6) places and normals as one place, so that the two sides of a wall are twice the weight apart."""
+    return np.hstack([places_mm, weight_mm * normals])

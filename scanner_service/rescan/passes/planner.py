@@ -163,6 +163,7 @@ def _recommend(
         places_mm=needs.places_mm[served],
         place_regions=needs.region[served].astype(np.float64),
         place_mm2=needs.gain_mm2[served],
+        place_normals=needs.normals[served],
         turn=choice.attitude.turn,
         trust=trust,
     )

@@ -41,7 +41,8 @@ class RecommendedPass:
 
     `duration_s` is the time of the pass itself, `approach_s` the time to get there (turning the part included);
     `promises` what it is to give, region by region; `gain_mm2` their sum. `places_mm` (k, 3) are the places served,
-    `place_regions` (k,) their regions and `place_mm2` (k,) their areas; they are kept for the reckoning afterwards.
+    `place_regions` (k,) their regions, `place_mm2` (k,) their areas and `place_normals` (k, 3) where they
+    face; they are kept for the reckoning afterwards.
     `turn` is what the operator does first; `trust` is what the promises were multiplied by, from earlier outcomes.
     """
 
@@ -57,11 +58,12 @@ class RecommendedPass:
     places_mm: Float64Array
     place_regions: Float64Array
     place_mm2: Float64Array
+    place_normals: Float64Array
     turn: PartTurn | None = None
     trust: float = 1.0
 
     def __post_init__(self) -> None:
-        for array in (self.places_mm, self.place_regions, self.place_mm2):
+        for array in (self.places_mm, self.place_regions, self.place_mm2, self.place_normals):
             read_only(array)
 
     @property
