@@ -5,8 +5,9 @@ JSON ?= $(OUT)/live-map.json
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+WORKERS ?= 2
 
-.PHONY: demo test test-long lint bench clean
+.PHONY: demo test test-long faults fuzz lint bench clean
 .DELETE_ON_ERROR:
 
 $(VENV)/installed: pyproject.toml
@@ -17,16 +18,35 @@ $(VENV)/installed: pyproject.toml
 
 $(VENV)/installed-dev: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	-$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'printrun==2.2.0'  # its core, without wx
 	@touch $@
 
 demo: $(VENV)/installed
 	$(BIN)/scanner demo --out $(OUT) $(ARGS)
 
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
 
 test-long: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m long --timeout 3600 $(ARGS)
+
+# Coverage-guided, one parser after the other; what it finds interesting stays in tests/fuzz/corpus.
+FUZZ_S ?= 60
+FUZZ ?= native scip lms lms_requests ls100 rplidar rplidar_samples rplidar_capsules
+fuzz: $(VENV)/installed-dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[fuzz]'
+	for target in $(FUZZ); do $(BIN)/python -m tests.fuzz $$target -max_total_time=$(FUZZ_S) -max_len=2048 $(ARGS) || exit 1; done
+
+# The release draws of the fault harness, some hours; ARGS="cuts --cuts 1000" makes one of them, smaller.
+faults: $(VENV)/installed-dev
+ifdef ARGS
+	$(BIN)/python -m tests.faults $(ARGS)
+else
+	$(BIN)/python -m tests.faults cuts
+	$(BIN)/python -m tests.faults faults
+	$(BIN)/python -m tests.faults flips
+	$(BIN)/python -m tests.faults kills
+endif
 
 # Open3D is large, and wanted here only; JSON=FILE chooses where the figures go.
 bench: $(VENV)/installed

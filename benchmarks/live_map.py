@@ -49,6 +49,7 @@ def cases(chosen: argparse.Namespace) -> Iterator[Case]:
             asked = ("--peer", peer, "--points", str(min(chosen.points, PEER_LIMIT)))
             yield Case(peer, threads, "peers", asked)
         yield Case("each_line", threads, "live_run", (*points, "--each-line"))
+        yield Case("flexible", threads, "live_run", ("--points", str(max(1, chosen.points // 2)), "--rule", "flexible"))
         for factor in () if chosen.one_radius else (2, 4):
             wide = ("--points", str(far), "--radius-factor", str(factor))
             yield Case(f"reader_{factor}r", threads, "live_run", wide)
@@ -107,7 +108,7 @@ def run(chosen: argparse.Namespace) -> Figures:
             for case in cases(chosen):
                 wait_for_quiet(chosen.patience_s)
                 more: list[str] = []
-                if case.module == "live_run" and number == 0:
+                if case.module == "live_run" and case.name != "flexible" and number == 0:
                     more = ["--checks", str(chosen.checks)]
                     if case.name == "reader" and chosen.points <= PEER_LIMIT:
                         more.append("--all-counts")

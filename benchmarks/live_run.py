@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,7 @@ from benchmarks.reader import Reader
 from scanner_service.analysis.compiling import compile_kernels
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.live_map import LiveMap, MapSettings
-from scanner_service.analysis.radius import RadiusSettings
+from scanner_service.analysis.radius import LiveRule, RadiusSettings
 
 READS_PER_S = 30.0
 DEFAULT_CEILING = MapSettings().max_points
@@ -31,7 +32,8 @@ class Plan:
 
     `each_line` has the map evaluated after every line; the reader comes 30 times a second in any case. At `checks`
     random lines a snapshot is compared with the oracle; `all_counts` compares every point at the end. With
-    `cold_memory` the map touches memory that the machine may have to fetch from its host first.
+    `cold_memory` the map touches memory that the machine may have to fetch from its host first. `rule` is the radius
+    rule; only `line` can be checked.
     """
 
     points: int
@@ -42,6 +44,7 @@ class Plan:
     all_counts: bool = False
     cold_memory: bool = False
     seed: int = 1
+    rule: LiveRule = "line"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +65,7 @@ class Times:
 def settings_for(plan: Plan, points: int) -> MapSettings:
     """The map's settings: the ceiling is the one that ships, unless the run needs more."""
     return MapSettings(
-        radius=RadiusSettings(uncertainty_mm(plan.radius_factor)),
+        radius=RadiusSettings(uncertainty_mm(plan.radius_factor), rule=plan.rule),
         noise_mm=NOISE_MM,
         max_points=max(points, DEFAULT_CEILING),
         threads=plan.threads,
@@ -231,8 +234,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--radius-factor", type=float, default=1.0)
     parser.add_argument("--checks", type=int, default=0)
     parser.add_argument("--all-counts", action="store_true")
+    parser.add_argument("--rule", choices=get_args(LiveRule), default="line")
     parser.add_argument("--cold-memory", action="store_true")
     chosen = parser.parse_args(arguments)
+    if chosen.rule != "line" and (chosen.checks or chosen.all_counts):
+        parser.error("answers are checked under the rule `line` only")
     use_cores(chosen.threads)
     print(json.dumps(measure(Plan(**vars(chosen)))))
 

@@ -23,6 +23,7 @@ def summarise(rounds: dict[tuple[str, int], list[Figures]]) -> dict[str, Figures
         summary[str(threads)] = {
             "points_per_s": reader["points_per_s"],
             "points_per_s_each_line": each_line["points_per_s"],
+            "points_per_s_flexible": of["flexible"]["points_per_s"] if "flexible" in of else None,
             "ratio_open3d": _ratio(reader, of.get("open3d")),
             "ratio_scipy": _ratio(reader, of.get("scipy")),
             "p50_s": each_line["p50_s"],
@@ -105,6 +106,7 @@ _ROWS = (
     ("  a line: 99 of 100 within, µs", "p99_s", 1e6, 0),
     ("  a line: longest, µs", "max_s", 1e6, 0),
     ("  last tenth to first tenth", "last_to_first_tenth", 1.0, 3),
+    ("flexible rule, 30 readings, million points/s", "points_per_s_flexible", 1e-6, 3),
     ("at 2r, million points/s", "points_per_s_2r", 1e-6, 3),
     ("  ratio to Open3D", "ratio_open3d_2r", 1.0, 2),
     ("at 4r, million points/s", "points_per_s_4r", 1e-6, 3),

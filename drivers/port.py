@@ -47,6 +47,9 @@ class ModemLines:
     hang_up: bool = True
 
 
+LEAVE_LINES = ModemLines()
+
+
 class Port:
     """An open tty, locked against a second opening by any program that asks for the lock.
 
@@ -55,7 +58,7 @@ class Port:
     PortAbsent, PortBusy, PortNotPermitted, PortNotSerial, PortRateRefused : when it cannot be opened.
     """
 
-    def __init__(self, path: str, baud_rate: int, lines: ModemLines = ModemLines()) -> None:
+    def __init__(self, path: str, baud_rate: int, lines: ModemLines = LEAVE_LINES) -> None:
         self.path = path
         _check_device_file(path)
         try:

@@ -12,12 +12,18 @@ device dropped itself is numbered too, and lost. Every loss has one reason:
 `conflict`        read, but it contradicts its line
 `host_overflow`   read, but the host's own queue was full
 
+Both laws hold for each pass by itself too. A loss is booked on the pass that ran when the gap began; after the end of a
+pass, on the one that ends the gap. The end of a pass and the acknowledgement of the next one's start carry totals, so
+what is lost is booked on the wrong one of two passes only when both of these are lost as well. A latecomer
+moves the number it fills to the pass it names.
+
 Counted apart, outside both laws: `duplicates` (a number read twice), `stale` (older than the account, or than the
 65,536 numbers in which a latecomer can be told from a duplicate) and `disagreements` (chunks by which the device's drop
 counter exceeds the gap it should explain).
 """
 
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -26,6 +32,9 @@ from drivers.protocols.unwrap import increase_u32, unwrap_u32
 
 _WINDOW = 65_536
 _MAX_GAPS = 1_024
+_MAX_PASSES = 1_024
+OTHER_PASSES = -1
+"""The pass under which everything is booked once a boot has told of more passes than can be kept apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +73,27 @@ class LineTally:
 
 
 @dataclass(frozen=True, slots=True)
+class PassTally:
+    """The accounts of one pass."""
+
+    chunks: ChunkTally = field(default_factory=ChunkTally)
+    lines: LineTally = field(default_factory=LineTally)
+
+    def __add__(self, other: "PassTally") -> "PassTally":
+        return PassTally(_add_chunks(self.chunks, other.chunks), _add_lines(self.lines, other.lines))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the accounts as plain nested dicts of integers, ready for JSON."""
+        return {"chunks": _chunks_to_dict(self.chunks), "lines": _lines_to_dict(self.lines)}
+
+
+@dataclass(frozen=True, slots=True)
 class Tally:
     """A moment's accounts of one scanner; `a + b` joins the accounts of two boots, or of two scanners.
 
     `damage` counts damaged pieces of the stream by reason, `bytes_skipped` their bytes. `no_return` counts points of
-    stored lines that the device itself gave no distance for, by the reason it told.
+    stored lines that the device itself gave no distance for, by the reason it told. `passes` has the accounts of each
+    pass, by boot id and pass index; they add up to `chunks` and `lines`.
     """
 
     chunks: ChunkTally = field(default_factory=ChunkTally)
@@ -79,40 +104,27 @@ class Tally:
     damage: dict[str, int] = field(default_factory=dict)
     bytes_skipped: int = 0
     no_return: dict[str, int] = field(default_factory=dict)
+    passes: Mapping[tuple[int, int], PassTally] = field(default_factory=dict)
 
     def __add__(self, other: "Tally") -> "Tally":
         a, b = self, other
         return Tally(
-            ChunkTally(
-                a.chunks.sent + b.chunks.sent, a.chunks.stored + b.chunks.stored, _join(a.chunks.lost, b.chunks.lost)
-            ),
-            LineTally(
-                a.lines.sent + b.lines.sent,
-                a.lines.whole + b.lines.whole,
-                a.lines.partial + b.lines.partial,
-                a.lines.open + b.lines.open,
-                _join(a.lines.lost, b.lines.lost),
-            ),
+            _add_chunks(a.chunks, b.chunks),
+            _add_lines(a.lines, b.lines),
             a.duplicates + b.duplicates,
             a.stale + b.stale,
             a.disagreements + b.disagreements,
             _join(a.damage, b.damage),
             a.bytes_skipped + b.bytes_skipped,
             _join(a.no_return, b.no_return),
+            {**a.passes, **{key: a.passes.get(key, PassTally()) + told for key, told in b.passes.items()}},
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the accounts as plain nested dicts of integers, ready for JSON."""
         return {
-            "chunks": {"sent": self.chunks.sent, "stored": self.chunks.stored, "lost": dict(self.chunks.lost)},
-            "lines": {
-                "sent": self.lines.sent,
-                "stored": self.lines.stored,
-                "whole": self.lines.whole,
-                "partial": self.lines.partial,
-                "open": self.lines.open,
-                "lost": dict(self.lines.lost),
-            },
+            "chunks": _chunks_to_dict(self.chunks),
+            "lines": _lines_to_dict(self.lines),
             "duplicates": self.duplicates,
             "stale": self.stale,
             "disagreements": self.disagreements,
@@ -120,6 +132,29 @@ class Tally:
             "bytes_skipped": self.bytes_skipped,
             "no_return": dict(self.no_return),
         }
+
+
+def _add_chunks(a: ChunkTally, b: ChunkTally) -> ChunkTally:
+    return ChunkTally(a.sent + b.sent, a.stored + b.stored, _join(a.lost, b.lost))
+
+
+def _add_lines(a: LineTally, b: LineTally) -> LineTally:
+    return LineTally(a.sent + b.sent, a.whole + b.whole, a.partial + b.partial, a.open + b.open, _join(a.lost, b.lost))
+
+
+def _chunks_to_dict(chunks: ChunkTally) -> dict[str, Any]:
+    return {"sent": chunks.sent, "stored": chunks.stored, "lost": dict(chunks.lost)}
+
+
+def _lines_to_dict(lines: LineTally) -> dict[str, Any]:
+    return {
+        "sent": lines.sent,
+        "stored": lines.stored,
+        "whole": lines.whole,
+        "partial": lines.partial,
+        "open": lines.open,
+        "lost": dict(lines.lost),
+    }
 
 
 def _join(a: dict[str, int], b: dict[str, int]) -> dict[str, int]:
@@ -151,59 +186,103 @@ class _Gap:
     high: int
     device: int
     cause: str
+    account: "_PassAccount"
     filled: set[int] = field(default_factory=set)
 
 
+@dataclass(slots=True)
+class _PassAccount:
+    """The account of one pass while it is kept."""
+
+    sent: int = 0
+    stored: int = 0
+    lost: "Counter[str]" = field(default_factory=Counter)
+    lines_sent: int = 0
+    whole: int = 0
+    partial: int = 0
+    open: int = 0
+    lost_lines: "Counter[str]" = field(default_factory=Counter)
+
+    def tally(self) -> PassTally:
+        return PassTally(
+            ChunkTally(self.sent, self.stored, _nonzero(self.lost)),
+            LineTally(self.lines_sent, self.whole, self.partial, self.open, _nonzero(self.lost_lines)),
+        )
+
+
 class BootLedger:
-    """The account of one boot of one device; counters are u32 on entry and 64 bits inside.
+    """The account of one boot of one device, pass by pass; counters are u32 on entry and 64 bits inside.
 
     `sequence` and `line` are the first numbers of the account, `dropped_chunks` and `dropped_lines` the device's drop
-    counters at that place.
+    counters at that place; `boot_id` names the boot in the tally.
     """
 
-    def __init__(self, sequence: int = 0, line: int = 0, dropped_chunks: int = 0, dropped_lines: int = 0) -> None:
-        self._first_sequence = self._next_sequence = sequence
-        self._first_line = self._next_line = line
+    def __init__(
+        self, sequence: int = 0, line: int = 0, dropped_chunks: int = 0, dropped_lines: int = 0, boot_id: int = 0
+    ) -> None:
+        self._boot_id = boot_id
+        self._next_sequence = sequence
+        self._next_line = line
         self._told_below = sequence  # below it a latecomer cannot be told from a duplicate
         self._dropped_chunks = dropped_chunks
         self._dropped_lines = dropped_lines
         self._gaps: deque[_Gap] = deque()
         self._cause = "missing"
-        self._stored = self._whole = self._partial = self._open = 0
-        self._lost: Counter[str] = Counter()
-        self._lost_lines: Counter[str] = Counter()
+        self._passes: dict[int, _PassAccount] = {}
+        self._told_pass: int | None = None  # the pass that the device last told of
+        self._of_chunk = _PassAccount()  # the account of the last chunk entered
+        self._of_open_lines: deque[_PassAccount] = deque()
         self._duplicates = self._stale = self._disagreements = 0
         self._damage: Counter[str] = Counter()
         self._bytes_skipped = 0
         self._no_return: Counter[str] = Counter()
 
-    def chunk(self, sequence: int, line: int, dropped_chunks: int, dropped_lines: int) -> Arrival:
+    def chunk(self, sequence: int, line: int, dropped_chunks: int, dropped_lines: int, pass_index: int = 0) -> Arrival:
         """Enter a chunk that was read, as stored; what comes of it otherwise is told by `not_kept`."""
         number = unwrap_u32(self._next_sequence, sequence)
         line = unwrap_u32(self._next_line, line)
         if number < self._next_sequence:
-            kind = self._latecomer(number)
-            self._stored += kind is Kind.NEW
-            return Arrival(kind, line, False)
-        cause = self._advance(number, dropped_chunks)
+            return Arrival(self._latecomer(number, pass_index), line, False)
+        gap_account = self._account(pass_index if self._told_pass is None else self._told_pass)
+        account = self._of_chunk = self._account(pass_index)
+        cause = self._advance(number, dropped_chunks, gap_account)
         self._next_sequence = number + 1
-        self._stored += 1
+        self._told_pass = pass_index
+        account.sent += 1
+        account.stored += 1
         if line < self._next_line:
             return Arrival(Kind.NEW, line, False)
-        self._advance_line(line, dropped_lines, cause)
+        self._advance_line(line, dropped_lines, cause, gap_account)
         self._next_line = line + 1
-        self._open += 1
+        account.lines_sent += 1
+        account.open += 1
+        self._of_open_lines.append(account)
         return Arrival(Kind.NEW, line, True)
 
-    def totals(self, next_sequence: int, next_line: int, dropped_chunks: int, dropped_lines: int) -> None:
-        """Enter the device's word on what it has numbered so far; older word than known is passed over."""
+    def totals(
+        self,
+        next_sequence: int,
+        next_line: int,
+        dropped_chunks: int,
+        dropped_lines: int,
+        pass_index: int | None = None,
+        pass_is_over: bool = False,
+    ) -> None:
+        """Enter the device's word on what it has numbered so far; older word than known is passed over.
+
+        `pass_index` is its latest pass; once that is over, what is numbered further belongs to the next one.
+        """
         number = unwrap_u32(self._next_sequence, next_sequence)
         if number < self._next_sequence:
             return
-        cause = self._advance(number, dropped_chunks)
         line = unwrap_u32(self._next_line, next_line)
+        told = self._told_pass if self._told_pass is not None else pass_index
+        account = self._account(OTHER_PASSES if told is None else told)
+        cause = self._advance(number, dropped_chunks, account)
         if line >= self._next_line:
-            self._advance_line(line, dropped_lines, cause)
+            self._advance_line(line, dropped_lines, cause, account)
+        if pass_index is not None:
+            self._told_pass = None if pass_is_over else pass_index
 
     def damage(self, reason: str, n_bytes: int) -> None:
         """Enter a damaged piece of the stream; it explains the gap it lies in, if there is one."""
@@ -221,22 +300,24 @@ class BootLedger:
         self._no_return.update(counts)
 
     def not_kept(self, reason: str) -> None:
-        """Move a chunk entered as stored to the lost ones."""
-        self._stored -= 1
-        self._lost[reason] += 1
+        """Move the chunk entered last from the stored to the lost ones."""
+        self._of_chunk.stored -= 1
+        self._of_chunk.lost[reason] += 1
 
     def line_closed(self, *, whole: bool) -> None:
-        """Enter that the open line was handed on."""
-        self._open -= 1
-        self._whole += whole
-        self._partial += not whole
+        """Enter that the line opened first was handed on."""
+        account = self._of_open_lines.popleft()
+        account.open -= 1
+        account.whole += whole
+        account.partial += not whole
 
     def line_not_kept(self, reason: str, n_chunks: int) -> None:
-        """Enter that the open line was closed and then lost, with the `n_chunks` of it that had arrived."""
-        self._open -= 1
-        self._lost_lines[reason] += 1
-        self._stored -= n_chunks
-        self._lost[reason] += n_chunks
+        """Enter that the line opened first was closed and then lost, with the `n_chunks` of it that had arrived."""
+        account = self._of_open_lines.popleft()
+        account.open -= 1
+        account.lost_lines[reason] += 1
+        account.stored -= n_chunks
+        account.lost[reason] += n_chunks
 
     def count_stale(self) -> None:
         """Enter a chunk that is none of this account's."""
@@ -244,24 +325,27 @@ class BootLedger:
 
     def tally(self) -> Tally:
         """Return the accounts as they stand."""
+        passes = {(self._boot_id, index): account.tally() for index, account in self._passes.items()}
+        whole = sum(passes.values(), PassTally())
         return Tally(
-            ChunkTally(self._next_sequence - self._first_sequence, self._stored, _nonzero(self._lost)),
-            LineTally(
-                self._next_line - self._first_line,
-                self._whole,
-                self._partial,
-                self._open,
-                _nonzero(self._lost_lines),
-            ),
+            whole.chunks,
+            whole.lines,
             self._duplicates,
             self._stale,
             self._disagreements,
             _nonzero(self._damage),
             self._bytes_skipped,
             _nonzero(self._no_return),
+            {key: told for key, told in passes.items() if told != PassTally()},
         )
 
-    def _advance(self, number: int, dropped_chunks: int) -> str:
+    def _account(self, pass_index: int) -> _PassAccount:
+        """The account of a pass; a device that tells of more passes than it can have run does not fill the memory."""
+        if pass_index not in self._passes and len(self._passes) >= _MAX_PASSES:
+            pass_index = OTHER_PASSES
+        return self._passes.setdefault(pass_index, _PassAccount())
+
+    def _advance(self, number: int, dropped_chunks: int, account: _PassAccount) -> str:
         """Account for all sequences below `number`; return the cause of the gap that ends there."""
         dropped = increase_u32(self._dropped_chunks, dropped_chunks)
         self._dropped_chunks = dropped_chunks
@@ -270,26 +354,28 @@ class BootLedger:
         self._disagreements += dropped - device
         cause, self._cause = self._cause, "missing"
         if lost:
-            self._lost["device_dropped"] += device
-            self._lost[cause] += lost - device
-            self._gaps.append(_Gap(self._next_sequence, number, device, cause))
+            account.sent += lost
+            account.lost["device_dropped"] += device
+            account.lost[cause] += lost - device
+            self._gaps.append(_Gap(self._next_sequence, number, device, cause, account))
             self._next_sequence = number
             self._forget_old_gaps()
         return cause
 
-    def _advance_line(self, line: int, dropped_lines: int, cause: str) -> None:
+    def _advance_line(self, line: int, dropped_lines: int, cause: str, account: _PassAccount) -> None:
         lost = line - self._next_line
         device = min(increase_u32(self._dropped_lines, dropped_lines), lost)
         self._dropped_lines = dropped_lines
-        self._lost_lines["device_dropped"] += device
-        self._lost_lines[cause] += lost - device
+        account.lines_sent += lost
+        account.lost_lines["device_dropped"] += device
+        account.lost_lines[cause] += lost - device
         self._next_line = line
 
     def _forget_old_gaps(self) -> None:
         while self._gaps and (len(self._gaps) > _MAX_GAPS or self._gaps[0].high < self._next_sequence - _WINDOW):
             self._told_below = self._gaps.popleft().high
 
-    def _latecomer(self, number: int) -> Kind:
+    def _latecomer(self, number: int, pass_index: int) -> Kind:
         if number < max(self._told_below, self._next_sequence - _WINDOW):
             self._stale += 1
             return Kind.STALE
@@ -297,13 +383,18 @@ class BootLedger:
         if gap is None or number in gap.filled:
             self._duplicates += 1
             return Kind.DUPLICATE
+        booked = gap.account
+        booked.sent -= 1
         if gap.high - gap.low - len(gap.filled) > gap.device:
-            self._lost[gap.cause] -= 1
+            booked.lost[gap.cause] -= 1
         else:  # the device sent what it had counted as dropped
-            self._lost["device_dropped"] -= 1
+            booked.lost["device_dropped"] -= 1
             gap.device -= 1
             self._disagreements += 1
         gap.filled.add(number)
+        account = self._of_chunk = self._account(pass_index)
+        account.sent += 1
+        account.stored += 1
         return Kind.NEW
 
 

@@ -22,12 +22,14 @@ import numpy as np
 from drivers.scanline import DeviceInfo, Float64Array, Pose
 from simulators.devices.native import NativeDevice
 from simulators.faults import Faults
+from simulators.known import DEFAULT_SPEED_MM_PER_S, KNOWN_DEVICES, KnownDevice, PassingPart
 from simulators.meshes import MeshError
 from simulators.optics import LaserLineScanner, demo_scanner
 from simulators.parts import PARTS, Part, mesh_part
-from simulators.pty_port import PtyPort, SimulatedPortError
+from simulators.pty_port import PtyPort, SimulatedPortError, UnknownDevice
 
 DEFAULT_BAUD_RATE = 3_000_000
+"""Of the native device; the others begin at the rate that their originals have when they are switched on."""
 STAGE_MM = (-100.0, 400.0)
 BUFFER_BYTES = 262_144
 """Larger than a real scanner's: the simulator shares a computer with its client, and a pause of the computer of up to
@@ -94,7 +96,9 @@ def serve_simulated_scanner(
     *,
     stop: threading.Event,
     announce: Callable[[Event], None],
-    baud_rate: int = DEFAULT_BAUD_RATE,
+    kind: str = "native",
+    baud_rate: int | None = None,
+    speed_mm_per_s: float = DEFAULT_SPEED_MM_PER_S,
     seed: int = 1,
     link_path: Path | None = None,
     faults: Faults | None = None,
@@ -108,6 +112,9 @@ def serve_simulated_scanner(
     ----------
     part : what lies under the scanner.
     announce : told of the port to open before anything else, then of every command carried out.
+    kind : `native`, which has a stage of its own, or one of `KNOWN_DEVICES`, under which the part passes at
+        `speed_mm_per_s`.
+    baud_rate : of the wire where the device does not set it itself: `native`.
     seed : of the noise, the dropouts and the faults.
     link_path : a symbolic link that always names the present terminal.
     commands : a file descriptor with one command a line; None: there are none.
@@ -117,21 +124,33 @@ def serve_simulated_scanner(
     simulators.pty_port.SimulatedPortError : when the link cannot be made, or the device failed.
     """
     scene_rng, wire_rng = np.random.default_rng(seed).spawn(2)
-    device = simulated_device(part, scene_rng, device_id=device_id, boot_id=boot_id)
-    port = PtyPort(device, baud_rate, faults, link_path=link_path, rng=wire_rng)
-    actions: dict[str, Callable[[], None]] = {
-        "unplug": port.unplug,
-        "replug": port.replug,
-        "reboot": lambda: port.in_loop(device.reboot),
-        "stop": stop.set,
-    }
+    actions: dict[str, Callable[[], None]] = {}
+    extras: Event = {"travel_mm": list(part.travel_mm), "part": part.description, "seed": seed}
+    if kind == "native":
+        native_rate = DEFAULT_BAUD_RATE if baud_rate is None else baud_rate
+        native = simulated_device(part, scene_rng, device_id=device_id, boot_id=boot_id)
+        port = PtyPort(native, native_rate, faults, link_path=link_path, rng=wire_rng)
+        actions["reboot"] = lambda: port.in_loop(native.reboot)
+        extras["baud_rate"] = native_rate
+
+        def identity() -> Event:
+            return {"device_id": device_id, "boot_id": native.boot_id}
+    else:
+        known = _known_device(kind, baud_rate)
+        device = known.makes(PassingPart(part, speed_mm_per_s, scene_rng))
+        port = PtyPort(device, known.baud_rate, faults, link_path=link_path, rng=wire_rng, heeds_client_rate=True)
+        extras |= {"baud_rate": known.baud_rate, "speed_mm_per_s": speed_mm_per_s}
+
+        def identity() -> Event:
+            return {"device": kind, "title": known.title}
+
+    actions |= {"unplug": port.unplug, "replug": port.replug, "stop": stop.set}
 
     def event(name: str) -> Event:
         where = str(port.path) if port.is_plugged else None
-        return {"event": name, "port": where, "device_id": device_id, "boot_id": device.boot_id}
+        return {"event": name, "port": where} | identity()
 
     with port:
-        extras = {"baud_rate": baud_rate, "travel_mm": list(part.travel_mm), "part": part.description, "seed": seed}
         # Opening a terminal throws away what waits in it: half of the greeting, if it is still on its way.
         while not (port.is_quiet or port.has_failed or stop.is_set()):
             stop.wait(0.002)
@@ -157,6 +176,17 @@ def serve_simulated_scanner(
                     announce({"event": "refused", "reason": f"{name!r} is no command; say one of {wanted}"})
 
 
+def _known_device(kind: str, baud_rate: int | None) -> KnownDevice:
+    if kind not in KNOWN_DEVICES:
+        raise UnknownDevice(f"there is no device {kind!r}; the devices are native, {', '.join(KNOWN_DEVICES)}")
+    known = KNOWN_DEVICES[kind]
+    if baud_rate is not None and baud_rate != known.baud_rate:
+        raise UnknownDevice(
+            f"{kind} begins at {known.baud_rate} baud, like its original, and cannot be set to {baud_rate}"
+        )
+    return known
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a simulated scanner as the command line says; the exit status."""
     given = _parser().parse_args(arguments)
@@ -168,7 +198,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             mesh_part(given.mesh, given.scale) if given.mesh else PARTS[given.part](),
             stop=stop,
             announce=lambda event: print(json.dumps(event), flush=True),
+            kind=given.device,
             baud_rate=given.baud,
+            speed_mm_per_s=given.speed,
             seed=given.seed,
             link_path=given.link,
             faults=_faults(given),
@@ -195,7 +227,11 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument("--mesh", type=Path, metavar="FILE", help="a mesh instead: .stl, .obj or .ply")
     parser.add_argument("--scale", type=float, default=1.0, help="millimetres in one unit of the mesh")
     parser.add_argument("--link", type=Path, metavar="PATH", help="a symbolic link that always names the terminal")
-    parser.add_argument("--baud", type=int, default=DEFAULT_BAUD_RATE, help="the rate of the wire")
+    parser.add_argument("--device", choices=["native", *KNOWN_DEVICES], default="native", help="the kind of scanner")
+    parser.add_argument(
+        "--speed", type=float, default=DEFAULT_SPEED_MM_PER_S, help="mm/s of the part under a scanner without a stage"
+    )
+    parser.add_argument("--baud", type=int, help=f"the rate of the native scanner's wire ({DEFAULT_BAUD_RATE})")
     parser.add_argument("--seed", type=int, default=1, help="of noise, dropouts and faults")
     parser.add_argument("--device-id", default="SIM-0001", help="the scanner's serial number")
     parser.add_argument("--boot-id", type=int, help="drawn anew when not given")

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -39,6 +39,7 @@ class SimulatedPortError(Exception):
     SimulatedPortError
     +-- LinkPathTaken     something that is not a link to a terminal is where the link should be
     +-- DeviceFailed      the simulated device raised; its exception is the cause
+    +-- UnknownDevice     no device of that name, or not with that rate
     """
 
 
@@ -48,6 +49,10 @@ class LinkPathTaken(SimulatedPortError):
 
 class DeviceFailed(SimulatedPortError):
     """The simulated device raised; its exception is the cause."""
+
+
+class UnknownDevice(SimulatedPortError):
+    """No device of that name can be simulated, or not with that rate."""
 
 
 class SerialDevice(Protocol):
@@ -61,6 +66,13 @@ class SerialDevice(Protocol):
 
     def next_due_s(self, now_s: float) -> float | None:
         """The time at which the device next has something to send; None = not before it receives something."""
+
+
+@runtime_checkable
+class RateChanging(Protocol):
+    """A device that changes its rate when it is told to: the port follows it."""
+
+    baud_rate: int
 
 
 @dataclass(slots=True)
@@ -252,6 +264,7 @@ class PtyPort:
         if self._rates_differ():
             arrived = misread(arrived, self._baud_rate, self.client_baud_rate() or self._baud_rate, self._rng)
             self._counts.misread_bytes += len(arrived)
+        self._follow_rate(now_s)
         if not self.is_plugged:
             self._counts.unplugged_bytes += len(arrived)
             return
@@ -280,6 +293,12 @@ class PtyPort:
             self._counts.misread_bytes += len(data)
             data = misread(data, self.client_baud_rate() or self._baud_rate, self._baud_rate, self._rng)
         self._device.receive(data, self._clock())
+        self._follow_rate(self._clock())
+
+    def _follow_rate(self, now_s: float) -> None:
+        if isinstance(self._device, RateChanging) and self._device.baud_rate != self._baud_rate:
+            self._baud_rate = self._device.baud_rate
+            self._pacer = Pacer(self._baud_rate, now_s)
 
     def _wait(self) -> bool:
         """Until the client sends, or fetches what is pending, or the device is due; True when there is input."""

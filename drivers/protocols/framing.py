@@ -30,6 +30,7 @@ class DamageReason(StrEnum):
     BAD_LAYOUT = "bad_layout"
     DEBRIS = "debris"  # bytes outside frames: no opening zero of their own, and they do not check
     CUT_OFF = "cut_off"  # the link went away in the middle of a frame
+    BAD_SUM = "bad_sum"  # a weaker check than a CRC-32 does not agree: other scanners' protocols
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,6 +120,17 @@ class NativeHost:
             return now_s - self._opened_s > SILENT_S
         return self.phase is Phase.UP and self._keeps_alive and now_s - self._heard_s > SILENT_S
 
+    @property
+    def is_met(self) -> bool:
+        """True once a device has said who it is, on this link or an earlier one."""
+        return self.stream is not None
+
+    def trouble(self, now_s: float) -> str | None:
+        """One sentence when the link is best opened anew; None while all is well."""
+        if self.is_silent(now_s):
+            return "the scanner has fallen silent; check cable and power"
+        return "another device answers" if self.phase is Phase.OTHER_DEVICE else None
+
     def receive(self, data: bytes, now_s: float) -> None:
         """Take bytes from the device."""
         if data:

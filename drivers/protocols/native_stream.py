@@ -39,7 +39,11 @@ class OpenLine:
     def add(self, chunk: Chunk) -> bool:
         """Take a chunk of this line; False, and nothing taken, when it contradicts those before."""
         place = slice(chunk.first_point, chunk.first_point + len(chunk.points))
-        if chunk.points_in_line != len(self._missing) or not self._missing[place].all():
+        if (
+            chunk.pass_index != self.header.pass_index
+            or chunk.points_in_line != len(self._missing)
+            or not self._missing[place].all()
+        ):
             return False
         self._points[place] = chunk.points
         self._missing[place] = False
@@ -99,7 +103,9 @@ class ProfileStream:
         self._earlier_boots = Tally()
         self._earlier_ids: set[int] = set()
         self._boot_id = status.boot_id
-        self._ledger = BootLedger(status.next_sequence, status.next_line, status.dropped_chunks, status.dropped_lines)
+        self._ledger = BootLedger(
+            status.next_sequence, status.next_line, status.dropped_chunks, status.dropped_lines, status.boot_id
+        )
 
     @property
     def boot_id(self) -> int:
@@ -127,14 +133,23 @@ class ProfileStream:
             return
         if self._open is not None and (status.next_line - self._open.header.line_index) % 2**32 in range(1, 2**31):
             self.close_line()
-        self._ledger.totals(status.next_sequence, status.next_line, status.dropped_chunks, status.dropped_lines)
+        self._ledger.totals(
+            status.next_sequence,
+            status.next_line,
+            status.dropped_chunks,
+            status.dropped_lines,
+            status.pass_index,
+            pass_is_over=not status.streaming,
+        )
 
     def chunk(self, chunk: Chunk, arrival_s: float) -> bool:
         """Take a chunk read at `arrival_s`; True when it was new and not of an earlier boot."""
         if not self._is_current(chunk.boot_id):
             self._ledger.count_stale()
             return False
-        arrival = self._ledger.chunk(chunk.sequence, chunk.line_index, chunk.dropped_chunks, chunk.dropped_lines)
+        arrival = self._ledger.chunk(
+            chunk.sequence, chunk.line_index, chunk.dropped_chunks, chunk.dropped_lines, chunk.pass_index
+        )
         if arrival.kind is not Kind.NEW:
             return False
         if arrival.opens_line:
@@ -177,7 +192,7 @@ class ProfileStream:
         self._earlier_ids.add(self._boot_id)
         self._earlier_boots += self._ledger.tally()
         self._boot_id = boot_id
-        self._ledger = BootLedger()
+        self._ledger = BootLedger(boot_id=boot_id)
 
     def _is_current(self, boot_id: int) -> bool:
         """Begin a new account when the device has rebooted; False for an earlier boot."""

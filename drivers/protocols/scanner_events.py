@@ -38,7 +38,7 @@ class Rebooted:
 
 @dataclass(frozen=True, slots=True)
 class PassEnded:
-    """A pass of the device is over: `reached_end`, `stopped`, `dead_man`, `fault` or `rebooted`."""
+    """A pass of the device is over: `reached_end`, `stopped`, `dead_man`, `fault`, `rebooted` or `disconnected`."""
 
     pass_index: int
     reason: str
@@ -59,4 +59,28 @@ class PassNotResumed:
     reason: str
 
 
-ScannerEvent: TypeAlias = Disconnected | Reconnected | OtherDevice | Rebooted | PassEnded | PassResumed | PassNotResumed
+@dataclass(frozen=True, slots=True)
+class ClockJumped:
+    """The device's clock was set back or ahead; its time goes on by the host's clock, `count` times so far."""
+
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """Something the user should know of how this scanner is being read; `text` is one sentence."""
+
+    text: str
+
+
+ScannerEvent: TypeAlias = (
+    Disconnected
+    | Reconnected
+    | OtherDevice
+    | Rebooted
+    | PassEnded
+    | PassResumed
+    | PassNotResumed
+    | ClockJumped
+    | Advice
+)

@@ -1,7 +1,11 @@
-"""Counters that wrap at 32 bits, continued to 64; knows nothing of what they count."""
+"""Counters that wrap, continued beyond; knows nothing of what they count."""
 
 _SPAN = 1 << 32
-_HALF = 1 << 31
+
+
+def unwrap(reference: int, value: int, span: int) -> int:
+    """Return the integer congruent to `value` modulo `span` that lies nearest to `reference`."""
+    return reference + (value - reference + span // 2) % span - span // 2
 
 
 def unwrap_u32(reference: int, value: int) -> int:
@@ -9,7 +13,7 @@ def unwrap_u32(reference: int, value: int) -> int:
 
     The result lies in [reference - 2**31, reference + 2**31), and may be negative: a counter older than the start.
     """
-    return reference + (value - reference + _HALF) % _SPAN - _HALF
+    return unwrap(reference, value, _SPAN)
 
 
 def increase_u32(before: int, after: int) -> int:

@@ -56,6 +56,10 @@ class FreeRunningScanner(Scanner, Protocol):
     goes back within `boot_id`, which is drawn at `enter`. `line_spacing_mm` and `step_mm` are NaN.
     """
 
+    @property
+    def baud_rate(self) -> int | None:
+        """The rate at which the device answers; None before `enter`."""
+
     def start_profiles(self, *, resume: bool = True) -> int:
         """Switch the laser on and begin; return the pass index.
 

@@ -1,43 +1,34 @@
 """A scanner that speaks the native protocol, on a serial port: enter, start, events, exit; decides no policy.
 
-The conversation itself is `drivers.protocols.native_host`, which knows no port; here are the port, the thread that
-reads it, and the bounded queue between that thread and whoever wants the lines.
+The conversation itself is `drivers.protocols.native_host`, which knows no port; the port, the thread that reads it and
+the bounded queue behind it are `link.py`.
 """
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from types import TracebackType
-from typing import Self, TypeAlias
+from typing import Self
 
 from drivers.errors import (
     DriverError,
-    PortError,
-    PortStalled,
     ProtocolUnsupported,
     ScannerNotConnected,
     ScannerRefused,
     ScannerSilent,
     ScannerTimeout,
 )
-from drivers.port import Port
 from drivers.protocols.native_host import NativeHost, Phase
 from drivers.protocols.native_messages import PROTOCOL_VERSION
 from drivers.protocols.native_requests import PassPlan, Request, describe_failure
-from drivers.protocols.scanner_events import ScannerEvent
-from drivers.scanline import DeviceInfo, Profile
+from drivers.scanline import DeviceInfo
+from drivers.scanners.face import Happening
+from drivers.scanners.link import Inbox, Link, Wire
 from drivers.tally import Tally
 
-Happening: TypeAlias = Profile | ScannerEvent
-
-_READ_S = 0.02
-_REOPEN_S = 0.1
 _ENTER_S = 4.0
-_STALL_S = 1.0
 _EXIT_S = 1.0
 _END_S = 5.0
-_MAX_EVENTS = 1_000
 
 
 class NativeScanner:
@@ -66,15 +57,10 @@ class NativeScanner:
         self._path = port_path
         self._baud_rate = baud_rate
         self._clock = clock
-        self._queue_lines = queue_lines
-        self._changed = threading.Condition()  # guards everything below except the port, which is the thread's
-        self._host = NativeHost(self._deliver, self._tell)
-        self._queue: deque[Happening] = deque()
-        self._lines_waiting = 0
-        self._skipped_events = 0
-        self._failure: Exception | None = None
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._changed = threading.Condition()  # guards everything below
+        self._inbox = Inbox(queue_lines)
+        self._host = NativeHost(self._inbox.deliver, self._inbox.tell)
+        self._link: Link | None = None
 
     def __enter__(self) -> Self:
         self.enter()
@@ -94,24 +80,18 @@ class NativeScanner:
         ScannerSilent : when nothing intelligible answers.
         ProtocolUnsupported : when the device speaks another version.
         """
-        if self._thread is not None:
+        if self._link is not None:
             raise DriverError(f"{self._path} has been entered already; exit first")
-        port = Port(self._path, self._baud_rate)
-        self._closing.clear()
-        self._host = NativeHost(self._deliver, self._tell)
-        self._host.link_opened(self._clock())
-        self._thread = threading.Thread(target=self._run, args=(port,), name=f"scanner {self._path}", daemon=True)
-        self._thread.start()
-        host = self._host
+        self._host = host = NativeHost(self._inbox.deliver, self._inbox.tell)
+        self._link = link = Link(self._path, host, self._changed, self._clock, lambda: Wire(self._baud_rate))
         with self._changed:
             self._changed.wait_for(
-                lambda: host.stream is not None or host.other_version is not None or self._failure is not None, _ENTER_S
+                lambda: host.stream is not None or host.other_version is not None or link.failure is not None, _ENTER_S
             )
-            stream, version, failure = host.stream, host.other_version, self._failure
+            stream, version, failure = host.stream, host.other_version, link.failure
         if stream is not None:
             return stream.info
         self.exit()
-        self._failure = None
         if failure is not None:
             raise failure
         if version is not None:
@@ -201,29 +181,26 @@ class NativeScanner:
         Exception : what has ended the reading thread, if something did.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._queue or self._failure is not None, timeout_s)
-            if self._failure is not None and not self._queue:
+            self._changed.wait_for(lambda: len(self._inbox) or self._failure is not None, timeout_s)
+            if self._failure is not None and not len(self._inbox):
                 raise self._failure
-            happenings = list(self._queue)
-            self._queue.clear()
-            self._lines_waiting = 0
-        return happenings
+            return self._inbox.take()
 
     def tally(self) -> Tally:
         """Return the exact accounts up to now, over all boots since `enter`."""
         with self._changed:
             stream = self._host.stream
-            return stream.tally() if stream is not None else Tally()
+            tally = stream.tally() if stream is not None else Tally()
+            return tally if self._link is None else self._link.with_overruns(tally)
 
     def exit(self) -> None:
         """Stop the pass, switch the laser off, close the port; never raises, and returns within about 2 s."""
-        thread = self._thread
-        if thread is None:
+        link = self._link
+        if link is None:
             return
         self._switch_off()
-        self._closing.set()
-        thread.join()
-        self._thread = None
+        link.close()
+        self._link = None
 
     def _switch_off(self) -> None:
         """Ask for laser off and stop, wait a little; where no answer comes the dead-man does it."""
@@ -240,7 +217,7 @@ class NativeScanner:
 
     def _command(self, ask: Callable[[], Request]) -> None:
         with self._changed:
-            if self._thread is None or self._host.phase is not Phase.UP:
+            if self._link is None or self._host.phase is not Phase.UP:
                 raise ScannerNotConnected(f"the scanner on {self._path} is not connected; wait until it is back")
             request = ask()
             self._changed.wait_for(lambda: request.done or self._failure is not None)
@@ -257,88 +234,7 @@ class NativeScanner:
             return f"what comes from {where} is not this protocol ({heard_bytes} bytes); try the scanner's other rates"
         return f"no scanner answers on {where}; check its power, the cable, the path and the rate"
 
-    # ---- in the thread; the functions given to the host are called with the lock held -----------------------------
-
-    def _deliver(self, profile: Profile) -> bool:
-        if self._lines_waiting >= self._queue_lines:
-            return False
-        self._queue.append(profile)
-        self._lines_waiting += 1
-        return True
-
-    def _tell(self, event: ScannerEvent) -> None:
-        if len(self._queue) - self._lines_waiting >= _MAX_EVENTS:
-            self._skipped_events += 1
-        else:
-            self._queue.append(event)
-
-    def _run(self, port: Port | None) -> None:
-        stalled_s: float | None = None
-        try:
-            while not self._closing.is_set():
-                try:
-                    if port is None:
-                        port = self._reopen()
-                        continue
-                    data = port.read(_READ_S)
-                    stalled_s = self._talk(port, data, stalled_s)
-                except PortError as error:
-                    if port is not None:
-                        port.close()
-                    port = None
-                    if not self._survives(error):
-                        return
-        except Exception as failure:  # noqa: BLE001 - the thread's loop: whoever waits must be told
-            with self._changed:
-                self._failure = failure
-                self._changed.notify_all()
-        finally:
-            if port is not None:
-                port.close()
-
-    def _talk(self, port: Port, data: bytes, stalled_s: float | None) -> float | None:
-        """Take what was read, send what is due; return since when the port has taken no bytes."""
-        with self._changed:
-            now_s = self._clock()
-            host = self._host
-            host.receive(data, now_s)
-            host.tick(now_s)
-            if host.is_silent(now_s):
-                raise PortStalled(self._path, f"the scanner on {self._path} has fallen silent; check cable and power")
-            if host.phase is Phase.OTHER_DEVICE:
-                raise PortStalled(self._path, f"another device answers on {self._path}")
-            if host.outgoing:
-                written = port.write(bytes(host.outgoing))
-                del host.outgoing[:written]
-                if written:
-                    stalled_s = None
-                elif stalled_s is None:
-                    stalled_s = now_s
-                elif now_s - stalled_s > _STALL_S:
-                    raise PortStalled(self._path, f"{self._path} takes no more bytes; check cable and power")
-            self._changed.notify_all()
-        return stalled_s
-
-    def _survives(self, error: PortError) -> bool:
-        """Tell of a lost link; True when it is worth waiting for, False when the device was never met."""
-        with self._changed:
-            met = self._host.stream is not None
-            self._host.link_lost(str(error), self._clock())
-            if not met:
-                self._failure = error
-            self._changed.notify_all()
-        return met
-
-    def _reopen(self) -> Port | None:
-        """Wait a little and try the path once."""
-        self._closing.wait(_REOPEN_S)
-        try:
-            port = Port(self._path, self._baud_rate)
-        except PortError:
-            with self._changed:
-                self._host.tick(self._clock())
-                self._changed.notify_all()
-            return None
-        with self._changed:
-            self._host.link_opened(self._clock())
-        return port
+    @property
+    def _failure(self) -> Exception | None:
+        """What has ended the reading thread."""
+        return None if self._link is None else self._link.failure

@@ -14,7 +14,7 @@ from numba import config
 def _cache_folder() -> str:
     """Where this version's kernels are kept: the user's cache, or what NUMBA_CACHE_DIR says."""
     sources = hashlib.sha256()
-    for file in sorted(Path(__file__).parent.glob("*.py")):
+    for file in sorted(Path(__file__).parent.rglob("*.py")):
         sources.update(file.read_bytes())
     home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return str(Path(home) / "scanner-service" / f"kernels-{sources.hexdigest()[:16]}")

@@ -48,10 +48,13 @@ AROUND_COUNT, AROUND_NEAR, AROUND_MASK = _tables()
 
 
 @intrinsic
-def lowest_bit(typing_context: Any, word: Any) -> Any:
-    """The number of the lowest bit that is set in a 64-bit word; for 0 the answer means nothing."""
+def _lowest_bit(typing_context: Any, word: Any) -> Any:
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
 
     return types.int64(types.uint64), generate
+
+
+lowest_bit: Any = _lowest_bit
+"""lowest_bit(word): the number of the lowest bit that is set in a 64-bit word; for 0 the answer means nothing."""

@@ -19,6 +19,8 @@ from scanner_service.analysis.snapshot import MapSnapshot, RadiusRule
 
 CloudRule = Literal["fixed", "flexible", "global"]
 
+TURNED_UP = "a plain cloud knows no laser: normals are turned upwards (+z)"
+
 
 @dataclass(frozen=True, slots=True)
 class CloudAnswer:
@@ -62,7 +64,7 @@ def analyse_cloud(
     middle = np.round((points_mm.min(axis=0) + points_mm.max(axis=0)) / 2.0)
     if seen_from_mm is None:
         seen_from_mm = middle + np.array([0.0, 0.0, 1e6])
-        notes.append("a plain cloud knows no laser: normals are turned upwards (+z)")
+        notes.append(TURNED_UP)
     line = quantise(_as_line(points_mm, seen_from_mm), middle)
     stored_mm = line.xyz_q.astype(np.float64)
     rows = np.arange(len(line.index))

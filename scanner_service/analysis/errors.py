@@ -2,7 +2,9 @@
 
 AnalysisError
 ├── MapFull          the configured ceiling of the live map is reached
-└── TooManyPasses    more passes are open at once than the map can tell apart
+├── TooManyPasses    more passes are open at once than the map can tell apart
+├── MethodUnknown    there is no method of that name
+└── MethodRefused    a method cannot do what is asked with these points or options
 """
 
 
@@ -16,3 +18,11 @@ class MapFull(AnalysisError):
 
 class TooManyPasses(AnalysisError):
     """More passes are open at once than the map can tell apart."""
+
+
+class MethodUnknown(AnalysisError):
+    """There is no method of that name."""
+
+
+class MethodRefused(AnalysisError):
+    """A method cannot do what is asked with these points or options."""

@@ -111,11 +111,13 @@ class LineColumns:
 
     def box_q(self, line: int) -> Int32Array:
         """The box (2, 3) of a line's points, to be filled by whoever writes them."""
-        return self._box_q[line]
+        box: Int32Array = self._box_q[line]
+        return box
 
     def laser_q(self, line: int) -> Float64Array:
         """Laser position (3,) of a line in quanta from the origin."""
-        return self._laser_q[line]
+        laser: Float64Array = self._laser_q[line]
+        return laser
 
     def kernel_columns(self) -> tuple[Float64Array, UInt8Array, UInt8Array]:
         """Laser positions (L, 3) in quanta from the origin, pass bits (L,) and what lines wait for, as views.

@@ -38,13 +38,21 @@ class Pass:
     front_mm: float = math.nan
     stations: dict[int, list[float]] = field(default_factory=dict)
     is_withdrawn: bool = False
+    first: StoredLine | None = None
+    turns: bool = False
 
     def stands_still_at(self, line: StoredLine) -> bool:
         """True when an accepted line of the pass lies closer than a quarter of the line spacing along the travel."""
-        if not np.isfinite(line.travel).all():
+        if not np.isfinite(line.travel).all() or (self.turns and not math.isfinite(line.position_mm)):
             return False
-        station = float(line.laser_mm @ line.travel)
         closest = STATIONARY_SHARE * line.line_spacing_mm
+        if self.first is None:
+            self.first = line
+        elif not self.turns and _turned(self.first, line):
+            self.turns = True
+            self.stations = {math.floor(self.first.position_mm / closest): [self.first.position_mm]}
+        # On a turntable the laser never moves along the tangent it travels by; there the stage position tells.
+        station = line.position_mm if self.turns else float(line.laser_mm @ line.travel)
         bin_index = math.floor(station / closest)
         for near in (bin_index - 1, bin_index, bin_index + 1):
             if any(abs(station - other) < closest for other in self.stations.get(near, ())):
@@ -68,6 +76,12 @@ class Pass:
         self.front_mm = front_mm
         self.is_steady = parallel and moved * self.direction >= 0.0
         return not self.is_steady
+
+
+def _turned(first: StoredLine, line: StoredLine) -> bool:
+    """True when the travel has turned between two lines, and both tell their stage positions."""
+    known = math.isfinite(first.position_mm) and math.isfinite(line.position_mm)
+    return known and float(line.travel @ first.travel) < 1.0 - 1e-9
 
 
 class PassBook:
@@ -120,6 +134,7 @@ class PassBook:
             return None
         slot, closed.slot = closed.slot, -1
         closed.stations.clear()
+        closed.first = None
         self._publish_unknown(slot)
         self.open_bits &= ~np.uint8(1 << slot)
         self._free.append(slot)

@@ -135,8 +135,13 @@ def sample_rows(
     state = np.full(len(place), int.from_bytes(digest, "little"), dtype=np.uint64)
     boot = np.full(len(place), boot_id, dtype=np.uint64)
     for part in (boot, line_index.astype(np.uint64), place.astype(np.uint64)):
-        state = (state ^ part) + np.uint64(0x9E3779B97F4A7C15)
-        state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        state ^= state >> np.uint64(31)
+        state = mixed(state ^ part)
     return np.flatnonzero(state % np.uint64(GLOBAL_SHARE) == 0)
+
+
+def mixed(state: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """One step of splitmix64: numbers that look random, and are the same every time."""
+    state = state + np.uint64(0x9E3779B97F4A7C15)
+    state = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    state = (state ^ (state >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return state ^ (state >> np.uint64(31))

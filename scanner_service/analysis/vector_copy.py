@@ -9,12 +9,7 @@ from numba.extending import intrinsic
 
 
 @intrinsic
-def widen_eight(typing_context: Any, source: Any, at: Any, row: Any, target: Any, column: Any) -> Any:
-    """target[row, column + k] = source[at, row, k] for 0 <= k < 8, from int32 (K, R, .) to float64 (R, N), unchecked.
-
-    What lies behind a row of the source that is shorter than 8 is copied, too.
-    """
-
+def _widen_eight(typing_context: Any, source: Any, at: Any, row: Any, target: Any, column: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> None:
         source_type, _, _, target_type, _ = signature.args
         source_array = context.make_array(source_type)(context, builder, arguments[0])
@@ -32,3 +27,11 @@ def widen_eight(typing_context: Any, source: Any, at: Any, row: Any, target: Any
         builder.store(builder.sitofp(numbers, wide), builder.bitcast(write_to, wide.as_pointer()), align=8)
 
     return types.void(source, types.intp, types.intp, target, types.intp), generate
+
+
+widen_eight: Any = _widen_eight
+"""widen_eight(source, at, row, target, column): target[row, column + k] = source[at, row, k] for 0 <= k < 8.
+
+From int32 (K, R, .) to float64 (R, N), unchecked; what lies behind a row of the source that is shorter than 8 is
+copied, too.
+"""

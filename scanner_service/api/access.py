@@ -15,7 +15,7 @@ Browser sessions and one-time logins live in memory, hashed; a restart ends them
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
 
@@ -75,11 +75,15 @@ ACCESS_PROBLEMS: dict[type[Exception], Problem] = {
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who asks: the role, a name to show and log (`label`), and how it was shown (`key` or `cookie`)."""
+    """Who asks: the role, a name to show and log (`label`), and how it was shown (`key` or `cookie`).
+
+    `credential_sha256` is the hash of what was shown: `Access.still_holds` tells whether it is good still.
+    """
 
     role: Role
     label: str
     means: str
+    credential_sha256: str = field(default="", repr=False, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +186,7 @@ class Access:
         stored = keyring.find(self._keys, key)
         if stored is None:
             raise self._refused(KeyUnknown("The key is not known here; ask an admin of this service for one."))
-        return Identity(stored.role, stored.label, "key")
+        return Identity(stored.role, stored.label, "key", stored.sha256)
 
     def issue_login(self, role: Role = Role.ADMIN, label: str = LOCAL_LABEL) -> str:
         """A token for one login within ten minutes, to be put into an address that a person opens."""
@@ -234,7 +238,15 @@ class Access:
             lent = self._sessions.get(keyring.sha256_of(value))
         if lent is None or lent.expires_s <= self._clock():
             raise self._refused(LoginEnded("The login of this browser has ended; log in again."))
-        return Identity(lent.role, lent.label, "cookie")
+        return Identity(lent.role, lent.label, "cookie", keyring.sha256_of(value))
+
+    def still_holds(self, identity: Identity) -> bool:
+        """True until the key is revoked, or the browser's login ends: what was opened with it must end too."""
+        if identity.means == "key":
+            return any(stored.sha256 == identity.credential_sha256 for stored in self._keys)
+        with self._lock:
+            lent = self._sessions.get(identity.credential_sha256)
+        return lent is not None and lent.expires_s > self._clock()
 
     def identify(self, connection: HTTPConnection) -> Identity:
         """Who sent a request or asks for a WebSocket; to be called before it is accepted.

@@ -7,20 +7,24 @@ from starlette.types import ASGIApp
 
 from drivers.errors import DriverError, PortAbsent, PortBusy, PortNotPermitted
 from scanner_service import __version__, web
-from scanner_service.analysis.errors import MapFull, TooManyPasses
+from scanner_service.analysis.errors import MapFull, MethodRefused, MethodUnknown, TooManyPasses
 from scanner_service.api.access import ACCESS_PROBLEMS
 from scanner_service.api.docs_page import install_docs
-from scanner_service.api.errors import ExportUnknown, ValueUnusable
+from scanner_service.api.errors import ExportUnknown, NotConfirmed, ValueUnusable
 from scanner_service.api.guard import Guard, GuardRules
 from scanner_service.api.login import login_router
 from scanner_service.api.origins import Allowlist
 from scanner_service.api.problems import Problem, ProblemTable, register_problems
-from scanner_service.api.routes import health, live, passes, results, scanlines, sessions
+from scanner_service.api.routes import analyses, exports, health, live, passes, results, scanlines, sessions
 from scanner_service.api.scopes import Scoped, check_every_route_declares_a_scope, public
 from scanner_service.api.service import Service
 from scanner_service.rescan.passes.errors import PassOutOfReach, PlanningError
 from scanner_service.rescan.requirement import RequirementUnusable
 from scanner_service.sessions.errors import (
+    AnalysesBusy,
+    AnalysisNotDone,
+    AnalysisUnknown,
+    BudgetSpent,
     LineRefused,
     PassUnknown,
     SessionBusy,
@@ -28,14 +32,17 @@ from scanner_service.sessions.errors import (
     SessionNotLive,
     SourceUnusable,
 )
-from scanner_service.storage.errors import RecordBusy, RecordError, SessionUnknown
-from scanner_service.storage.exports.errors import ExportError
+from scanner_service.storage.errors import CreationKeyReused, RecordBusy, RecordError, SessionUnknown
+from scanner_service.storage.exports.errors import ExportError, ExtraMissing, FormatNotWritten
 from scanner_service.storage.formats.errors import FormatError
 
 SESSION_PROBLEMS: ProblemTable = {
     SessionUnknown: Problem(404, "session-unknown", "There is no such session"),
     SessionBusy: Problem(409, "session-busy", "The session is in another state"),
     SessionNotLive: Problem(409, "session-not-live", "The session is not open"),
+    BudgetSpent: Problem(507, "budget-spent", "The disk budget is used up"),
+    NotConfirmed: Problem(409, "not-confirmed", "Deleting needs a confirmation"),
+    CreationKeyReused: Problem(422, "idempotency-key-reused", "The key came before, with another request"),
     SessionError: Problem(409, "session-error", "The session cannot do that"),
     PassUnknown: Problem(404, "pass-unknown", "There is no such pass"),
     PassOutOfReach: Problem(422, "pass-out-of-reach", "The pass would leave the limits of the rig"),
@@ -49,12 +56,19 @@ SESSION_PROBLEMS: ProblemTable = {
     DriverError: Problem(502, "scanner-error", "The scanner does not do its part"),
     TooManyPasses: Problem(409, "too-many-passes", "Too many passes are open"),
     TimeoutError: Problem(503, "record-slow", "The disk does not answer"),
+    AnalysisUnknown: Problem(404, "analysis-unknown", "There is no such analysis"),
+    AnalysisNotDone: Problem(409, "analysis-not-done", "The analysis has no result"),
+    AnalysesBusy: Problem(503, "analyses-busy", "Too many analyses are waiting"),
+    MethodUnknown: Problem(422, "method-unknown", "There is no such method"),
+    MethodRefused: Problem(422, "method-refused", "The method cannot do that"),
     MapFull: Problem(507, "map-full", "The live map is full"),
     RecordBusy: Problem(503, "record-busy", "The record cannot take more now"),
     RecordError: Problem(500, "record-error", "The record failed"),
     RequirementUnusable: Problem(422, "requirement-unusable", "No scan could be judged by this"),
     ValueUnusable: Problem(422, "invalid-value", "A value cannot be used"),
     ExportUnknown: Problem(404, "export-unknown", "There is no such export"),
+    FormatNotWritten: Problem(422, "format-unknown", "There is no such format"),
+    ExtraMissing: Problem(501, "format-not-installed", "The format needs a library that is not installed"),
     ExportError: Problem(507, "export-failed", "The file could not be written"),
 }
 PUSH_BODY_BYTES = 4 << 20
@@ -72,7 +86,7 @@ def make_app(service: Service, allowlist: Allowlist | None = None) -> ASGIApp:
     register_problems(app, problems)
     install_docs(app, problems.values())
     app.include_router(login_router())
-    for module in (health, sessions, scanlines, results, passes, live):
+    for module in (health, sessions, scanlines, results, passes, exports, live, analyses):
         app.include_router(module.router)
 
     @app.get("/", dependencies=[Depends(public)], include_in_schema=False)

@@ -2,6 +2,7 @@
 
 ApiError
 ├── ValueUnusable    a value of the request that the schema could not judge
+├── NotConfirmed     a request that destroys something came without its confirmation
 └── ExportUnknown    there is no export of that name
 """
 
@@ -12,6 +13,10 @@ class ApiError(Exception):
 
 class ValueUnusable(ApiError):
     """A value of the request that the schema could not judge."""
+
+
+class NotConfirmed(ApiError):
+    """A request that destroys something came without its confirmation."""
 
 
 class ExportUnknown(ApiError):

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from drivers.scanline import Float64Array, Scanline
+from scanner_service.analysis.normals.field import NormalOptions
 from scanner_service.analysis.radius import LiveRule
 from scanner_service.sessions.settings import SessionSettings
 
@@ -22,7 +23,11 @@ class Strict(BaseModel):
 
 
 class DeviceSourceIn(Strict):
-    """One pass of a scanner that speaks the native protocol."""
+    """One pass of a scanner that speaks the native protocol.
+
+    `rearm`: after an interruption longer than the device's dead-man the laser is switched on again by itself and the
+    pass goes on; by default the session waits, paused, until it is resumed.
+    """
 
     kind: Literal["device"]
     port: Annotated[str, Field(min_length=1, max_length=500, examples=["/dev/ttyUSB0"])]
@@ -31,6 +36,20 @@ class DeviceSourceIn(Strict):
     start_mm: Finite
     end_mm: Finite
     line_rate_hz: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] = 50.0
+    rearm: bool = False
+
+
+class RigSourceIn(Strict):
+    """One pass of a rig whose file lies in the service's folder of rigs; `rig` is its bare name. It moves the stage."""
+
+    kind: Literal["rig"]
+    rig: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00]+$", examples=["bench.toml"])]
+    line_spacing_mm: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.2
+    start_mm: Finite
+    end_mm: Finite
+    speed_mm_per_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    home: bool = False
+    at_mm: Finite | None = None
 
 
 class ReplaySourceIn(Strict):
@@ -71,9 +90,16 @@ class SessionIn(Strict):
     """A session to be made."""
 
     name: Annotated[str, Field(min_length=1, max_length=200)] = "scan"
-    source: Annotated[DeviceSourceIn | ReplaySourceIn | PushSourceIn, Field(discriminator="kind")]
+    source: Annotated[DeviceSourceIn | RigSourceIn | ReplaySourceIn | PushSourceIn, Field(discriminator="kind")]
     settings: SettingsIn = SettingsIn()
     origin_mm: Vector = (0.0, 0.0, 0.0)
+
+
+class DescriptionIn(Strict):
+    """What a person says of a session; what is left out stays."""
+
+    name: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+    notes: Annotated[str, Field(max_length=20_000)] | None = None
 
 
 class ScanlineIn(Strict):
@@ -121,6 +147,50 @@ class ScanlineIn(Strict):
             line_spacing_mm=self.line_spacing_mm,
             step_mm=math.nan if self.step_mm is None else self.step_mm,
         )
+
+
+class SessionPointsIn(Strict):
+    """The points of a session, each normal turned to the laser of its own scanline."""
+
+    kind: Literal["session"]
+    session_id: Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[0-9a-z]+$", examples=["1m82614ch5ada4"])]
+
+
+class FilePointsIn(Strict):
+    """A cloud that lies in the service's replay folder; `file` is its bare name."""
+
+    kind: Literal["file"]
+    file: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00]+$", examples=["part.ply"])]
+    units: Literal["mm", "m", "inch", "auto"] | None = None
+    seen_from_mm: Vector | None = None
+
+
+Length = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
+
+
+class MethodOptionsIn(Strict):
+    """What a method is told; each reads its own, and what is left out it chooses itself."""
+
+    radius_mm: Length | None = None
+    neighbours: Annotated[int, Field(ge=6, le=5000)] | None = None
+    noise_mm: Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)] | None = None
+    floor_mm: Length | None = None
+    ceiling_mm: Length | None = None
+    ball_factor: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] | None = None
+    max_error_deg: Annotated[float, Field(gt=0, le=90, allow_inf_nan=False)] = 5.0
+
+    def to_options(self) -> NormalOptions:
+        """As the methods take them; raises ValueError where two do not go together."""
+        values = self.model_dump()
+        return NormalOptions(max_error_rad=math.radians(values.pop("max_error_deg")), **values)
+
+
+class AnalysisIn(Strict):
+    """A method, and the points it is to work on."""
+
+    method: Annotated[str, Field(min_length=1, max_length=60, examples=["gaussian", "bivariate_quadric"])]
+    source: Annotated[SessionPointsIn | FilePointsIn, Field(discriminator="kind")]
+    options: MethodOptionsIn = MethodOptionsIn()
 
 
 class PassIn(Strict):

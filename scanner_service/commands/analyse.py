@@ -1,5 +1,6 @@
 """`scanner analyse`: density and normals of a plain cloud that has no scanlines."""
 
+import math
 from pathlib import Path
 from typing import Annotated, cast, get_args
 
@@ -7,9 +8,14 @@ import numpy as np
 import typer
 
 from scanner_service import __version__
-from scanner_service.analysis.cloud import CloudRule, analyse_cloud
+from scanner_service.analysis.cloud import TURNED_UP, CloudRule, analyse_cloud
+from scanner_service.analysis.method_analysis import METHOD_NAMES
+from scanner_service.analysis.normals.field import NormalOptions
 from scanner_service.analysis.snapshot import Unreliable
+from scanner_service.commands.analyse_by_method import analyse_file_by_method, refuse
+from scanner_service.commands.clouds import open_points
 from scanner_service.commands.options import parse_position, parse_units
+from scanner_service.commands.orienting import orient_snapshot
 from scanner_service.commands.terminal import check_folder, console, errors, plain_errors, show_json
 from scanner_service.sessions.results import summarise_cloud
 from scanner_service.storage.exports.density_png import density_png
@@ -22,7 +28,7 @@ NO_REGIONS = "a plain cloud has no scanlines, so it cannot be told where the sca
 
 
 def analyse_command(
-    file: Annotated[Path, typer.Argument(help="PLY, XYZ or CSV.")],
+    file: Annotated[Path, typer.Argument(help="PLY, PCD, LAS, LAZ, E57, XYZ or CSV; with --method also a record.")],
     out: Annotated[Path, typer.Option(help="Folder for the result files.")] = Path("out"),
     radius: Annotated[float | None, typer.Option(help="One radius in mm for all points.")] = None,
     rule: Annotated[str | None, typer.Option(help="fixed, flexible (20 points each) or global (median).")] = None,
@@ -30,11 +36,43 @@ def analyse_command(
     max_radius: Annotated[float | None, typer.Option(help="Largest radius in mm; 2 by default.")] = None,
     seen_from: Annotated[str | None, typer.Option(help="x,y,z in mm that normals are turned to.")] = None,
     density: Annotated[float | None, typer.Option(help="Required points per mm².")] = None,
+    orient: Annotated[bool, typer.Option("--orient", help="Turn normals to the outside, and say how sure.")] = False,
+    method: Annotated[
+        str | None, typer.Option(help="Normals or curvatures by another method: " + ", ".join(METHOD_NAMES) + ".")
+    ] = None,
+    neighbours: Annotated[int | None, typer.Option(help="With --method: points of a neighbourhood.")] = None,
+    noise: Annotated[float | None, typer.Option(help="With --method: noise in mm; estimated when not given.")] = None,
+    floor: Annotated[float | None, typer.Option(help="With --method: least radius in mm.")] = None,
+    ceiling: Annotated[float | None, typer.Option(help="With --method: largest radius in mm.")] = None,
+    ball_factor: Annotated[float | None, typer.Option(help="With --method: when a Delaunay ball is big.")] = None,
+    max_error: Annotated[float, typer.Option(help="With --method: normals less certain (degrees) are left out.")] = 5.0,
+    session: Annotated[str | None, typer.Option(help="With --method: which session of a record file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Analyse a cloud with a given radius or one of the chapter's rules, and write the result files."""
     with plain_errors():
+        stated: dict[str, object] = {"neighbours": neighbours, "noise": noise, "floor": floor, "ceiling": ceiling}
+        stated |= {"ball-factor": ball_factor, "session": session}
+        if method is not None:
+            without: dict[str, object] = {"rule": rule, "max-radius": max_radius, "density": density}
+            refuse(without | {"orient": orient or None}, f"leave it out with --method {method}")
+            options = NormalOptions(
+                radius_mm=radius,
+                neighbours=neighbours,
+                noise_mm=noise,
+                floor_mm=floor,
+                ceiling_mm=ceiling,
+                ball_factor=ball_factor,
+                max_error_rad=math.radians(max_error),
+            )
+            analyse_file_by_method(
+                open_points(file, units, session), method, options, parse_position(seen_from), out, as_json
+            )
+            return
+        refuse(stated, "it belongs to --method")
         chosen = _rule(rule, radius)
+        if orient and seen_from is not None:
+            raise ValueError("--seen-from tells the side of each normal, --orient finds it: leave one of them out")
         check_folder(out)
         cloud = open_cloud(file, ReadOptions(parse_units(units)))
         position = parse_position(seen_from)
@@ -46,12 +84,16 @@ def analyse_command(
                 max_radius_mm=max_radius,
                 seen_from_mm=None if position is None else np.array(position),
             )
-        notes = (*cloud.notes, *found.notes)
+        snapshot, notes = found.snapshot, (*cloud.notes, *found.notes)
+        oriented = {}
+        if orient:
+            with errors.status("orienting normals …"):
+                snapshot, oriented["orientation"], told = orient_snapshot(snapshot, out)
+            notes = (*(note for note in notes if note != TURNED_UP), *told)
         for note in notes:
             errors.print(f"note: {note}", highlight=False, soft_wrap=True)
-        snapshot = found.snapshot
         losses = {"points": {"declared": cloud.points_declared, "dropped": dict(cloud.dropped) | found.dropped}}
-        summary = {"name": file.name} | summarise_cloud(snapshot, losses, __version__, notes)
+        summary = {"name": file.name} | summarise_cloud(snapshot, losses, __version__, notes) | oriented
         rescan = np.zeros(len(snapshot), dtype=np.bool_)
         if density is not None:
             rescan = (snapshot.density_per_mm2 < density) & (snapshot.unreliable != Unreliable.NOT_COUNTED)
@@ -69,7 +111,8 @@ def analyse_command(
             "normal" + (f"; {summary['below_required']:,} below {density:g} points/mm²" if density is not None else ""),
             highlight=False,
         )
-        console.print(f"Written to {out}: points.ply, density.png, regions.json, summary.json", highlight=False)
+        files = "points.ply, density.png, regions.json, summary.json" + (", oriented.ply" if orient else "")
+        console.print(f"Written to {out}: {files}", highlight=False)
 
 
 def _rule(rule: str | None, radius: float | None) -> CloudRule:

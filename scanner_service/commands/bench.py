@@ -13,11 +13,6 @@ from scanner_service.commands.terminal import fail
 bench_app = typer.Typer(help="Measure how fast the service is, beside the tools that people use today.")
 
 
-@bench_app.callback()
-def _bench() -> None:
-    """Keep `live-map` a command of its own, although there is no other yet."""
-
-
 @bench_app.command("live-map")
 def live_map_command(
     json_file: Annotated[Path | None, typer.Option("--json", help="File for the figures.")] = None,
@@ -30,14 +25,7 @@ def live_map_command(
     warm_only: Annotated[bool, typer.Option("--warm-only", help="Leave the cold start out.")] = False,
 ) -> None:
     """Measure the live map and its peers by turns, print ratios, save JSON; takes some minutes."""
-    root = project_root()
-    if root is None:
-        fail(
-            "The benchmarks are not part of the installed package: clone the project and run "
-            "`scanner bench live-map` from there, installed with `pip install --editable '.[bench]'`."
-        )
-    command = [sys.executable, "-m", "benchmarks.live_map", "--points", str(points), "--repeats", str(repeats)]
-    command += ["--checks", str(checks)]
+    command = ["benchmarks.live_map", "--points", str(points), "--repeats", str(repeats), "--checks", str(checks)]
     if json_file is not None:
         command += ["--json", str(json_file.absolute())]
     if threads:
@@ -49,8 +37,47 @@ def live_map_command(
     ):
         if is_wanted:
             command.append(flag)
-    done = subprocess.run(command, cwd=root, check=False)
-    if done.returncode != 0:
+    _run(command)
+
+
+@bench_app.command("neighbours")
+def neighbours_command(
+    json_file: Annotated[Path | None, typer.Option("--json", help="File for the figures.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the plot, neighbours.png.")] = Path("out"),
+    points: Annotated[int, typer.Option(min=2000, help="Points of the cloud.")] = 200_000,
+    repeats: Annotated[int, typer.Option(min=1, help="Rounds; the best counts.")] = 3,
+) -> None:
+    """Measure how the cost of range queries grows with the radius: table, plot, JSON."""
+    command = ["benchmarks.neighbours", "--points", str(points), "--repeats", str(repeats)]
+    command += ["--out", str(out.absolute())]
+    if json_file is not None:
+        command += ["--json", str(json_file.absolute())]
+    _run(command)
+
+
+@bench_app.command("orientation")
+def orientation_command(
+    json_file: Annotated[Path | None, typer.Option("--json", help="File for the figures.")] = None,
+    points: Annotated[int, typer.Option(min=2000, help="Points of the cloud.")] = 1_000_000,
+    threads: Annotated[int, typer.Option(min=1, help="Number of threads.")] = 2,
+    without_peers: Annotated[bool, typer.Option("--without-peers", help="Leave Open3D and CloudCompare out.")] = False,
+) -> None:
+    """Measure normals and their orientation beside Open3D and CloudCompare, print ratios, save JSON."""
+    command = ["benchmarks.orientation", "--points", str(points), "--threads", str(threads)]
+    if json_file is not None:
+        command += ["--json", str(json_file.absolute())]
+    _run([*command, "--without-peers"] if without_peers else command)
+
+
+def _run(command: list[str]) -> None:
+    """Run a module of the benchmarks from the checkout; its status is ours."""
+    root = project_root()
+    if root is None:
+        fail(
+            "The benchmarks are not part of the installed package: clone the project and run "
+            "`scanner bench` from there, installed with `pip install --editable '.[bench]'`."
+        )
+    if subprocess.run([sys.executable, "-m", *command], cwd=root, check=False).returncode != 0:
         raise typer.Exit(1)
 
 

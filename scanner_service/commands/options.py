@@ -1,8 +1,34 @@
 """Options that several commands read in the same way; raises ValueError with one plain sentence."""
 
-from typing import cast, get_args
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, cast, get_args
+
+import typer
 
 from scanner_service.storage.formats.recording import Units
+from scanner_service.storage.reader import RecordReader
+
+Data = Annotated[
+    Path, typer.Option("--data", envvar="SCANNER_DATA", help="Folder of the service whose record is read.")
+]
+RecordFile = Annotated[
+    str | None, typer.Option("--record", envvar="SCANNER_RECORD", help="Another record: a file, or postgresql://….")
+]
+
+
+@contextmanager
+def open_reader(data: Path, record: str | None) -> Iterator[RecordReader]:
+    """The record of a service's folder, or the record file named; a running service is not disturbed.
+
+    Raises RecordUnusable.
+    """
+    reader = RecordReader.open(record or data / "record.sqlite")
+    try:
+        yield reader
+    finally:
+        reader.close()
 
 
 def parse_units(text: str | None) -> Units | None:

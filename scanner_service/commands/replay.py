@@ -19,6 +19,7 @@ from scanner_service.commands.terminal import (
     show_json,
 )
 from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.outputs import OUTPUT_FILES, write_outputs
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
@@ -78,16 +79,18 @@ def replay_command(
             book = SessionBook(opened)
             stack.callback(book.close)
             live = book.create(file.name, spec, settings, origin_mm, source)
-            _play(live, quiet=as_json)
+            play(live, quiet=as_json)
             summary = write_outputs(out, live)
             results = live.results()
+            if results is not None:
+                summary["verdict_sha256"] = verdict_sha256(results)
         if as_json:
             show_json(summary)
         elif results is not None:
-            _tell(results.report.to_dict()["regions"], summary, out)
+            tell(results.report.to_dict()["regions"], summary, out)
 
 
-def _play(session: LiveSession, quiet: bool) -> None:
+def play(session: LiveSession, quiet: bool) -> None:
     """Run the session to its end."""
     session.start()
     with scan_progress("replaying", quiet) as progress:
@@ -103,7 +106,8 @@ def _facts(session: LiveSession) -> dict[str, Any]:
     return {name: getattr(status, name) for name in ("lines", "points_per_s", "coverage", "progress", "losses")}
 
 
-def _tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
+def tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
+    """Print the regions as a table, and what the scan came to."""
     console.print(regions_table(regions, "Rescan regions"))
     share = summary["coverage"]["share"]
     console.print(
@@ -113,6 +117,7 @@ def _tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
         f"({summary['coverage']['gap_mm2']:,.0f} mm² of gaps)",
         highlight=False,
     )
+    console.print(f"SHA-256 of the verdict: {summary['verdict_sha256']}", highlight=False, soft_wrap=True)
     console.print(f"Written to {out}: {', '.join(OUTPUT_FILES)}", highlight=False, soft_wrap=True)
 
 

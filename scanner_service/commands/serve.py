@@ -12,9 +12,14 @@ from scanner_service.api.origins import Allowlist
 from scanner_service.api.server import Listening, Tls, serve
 from scanner_service.api.service import Service
 from scanner_service.commands.terminal import errors, plain_errors
+from scanner_service.sessions.retention import Retention
+from scanner_service.storage.rows import Limits
 
 DATA_HELP = "Folder of the record, the keys and the replay files."
 Data = Annotated[Path, typer.Option("--data", envvar="SCANNER_DATA", help=DATA_HELP)]
+RECORD_HELP = (
+    "Where the record is kept: a file, or postgresql://user@host/database; a file in the data folder by default."
+)
 DEFAULT_DATA = Path.home() / ".local" / "share" / "scanner-service"
 
 
@@ -26,6 +31,22 @@ def serve_command(
     private_key: Annotated[Path | None, typer.Option(help="TLS private key (PEM).")] = None,
     allow_host: Annotated[list[str] | None, typer.Option(help="A further name this service answers to.")] = None,
     allow_origin: Annotated[list[str] | None, typer.Option(help="A further origin whose pages may use it.")] = None,
+    record: Annotated[str | None, typer.Option(envvar="SCANNER_RECORD", help=RECORD_HELP, show_envvar=True)] = None,
+    keep_days: Annotated[
+        float | None,
+        typer.Option(envvar="SCANNER_KEEP_DAYS", help="Delete sessions older than this; never by default."),
+    ] = None,
+    disk_budget_gb: Annotated[
+        float | None,
+        typer.Option(
+            envvar="SCANNER_DISK_BUDGET_GB",
+            help="Gigabytes that stored lines may take; the oldest sessions are deleted for it. No limit by default.",
+        ),
+    ] = None,
+    spool_mb: Annotated[
+        float,
+        typer.Option(envvar="SCANNER_SPOOL_MB", min=0.01, max=4096, help="Megabytes of lines kept while a disk fails."),
+    ] = 64.0,
     as_json: Annotated[bool, typer.Option("--json", help="Say where it listens as one line of JSON.")] = False,
 ) -> None:
     """Run the service: REST, live stream and viewer."""
@@ -34,7 +55,10 @@ def serve_command(
             raise ValueError("--certificate and --private-key belong together: give both or neither")
         tls = Tls(certificate, private_key) if certificate is not None and private_key is not None else None
         allowlist = Allowlist(frozenset(allow_host or ()), frozenset(allow_origin or ()))
-        service = Service.open(data)
+        budget_bytes = None if disk_budget_gb is None else round(disk_budget_gb * 1e9)
+        service = Service.open(
+            data, record, Retention(keep_days, budget_bytes), Limits(spool_bytes=round(spool_mb * 1e6))
+        )
 
         def announce(listening: Listening) -> None:
             if as_json:

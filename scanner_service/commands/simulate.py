@@ -1,4 +1,4 @@
-"""`scanner simulate`: a simulated laser-line scanner behind a pseudo-terminal."""
+"""`scanner simulate`: a simulated scanner of one of the known kinds behind a pseudo-terminal."""
 
 import signal
 import threading
@@ -11,10 +11,18 @@ from scanner_service.commands.terminal import console, errors, fail, plain_error
 
 
 def simulate_command(
+    device: Annotated[
+        str, typer.Option(help="Kind of scanner: native (with a stage of its own), scip, lms200, rplidar or ls100.")
+    ] = "native",
     part: Annotated[str, typer.Option(help="Part under the scanner: demo, plate, step or sphere.")] = "demo",
     mesh: Annotated[Path | None, typer.Option(help="A mesh instead: .stl, .obj or .ply.")] = None,
     scale: Annotated[float, typer.Option(help="Millimetres in one unit of the mesh.")] = 1.0,
-    baud: Annotated[int, typer.Option(min=1, help="Rate of the wire.")] = 3_000_000,
+    speed: Annotated[
+        float, typer.Option(min=0.0, help="Speed in mm/s at which the part passes under a scanner without a stage.")
+    ] = 5.0,
+    baud: Annotated[
+        int | None, typer.Option(min=1, help="Rate of a native scanner's wire, 3000000 if not given.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of noise, dropouts and faults.")] = 1,
     link: Annotated[Path | None, typer.Option(help="A symbolic link that always names the terminal.")] = None,
     flip_rate: Annotated[float, typer.Option(help="Chance that a bit is flipped on the wire.")] = 0.0,
@@ -49,7 +57,9 @@ def simulate_command(
                 mesh_part(mesh, scale) if mesh is not None else PARTS[part](),
                 stop=stop,
                 announce=announce,
+                kind=device,
                 baud_rate=baud,
+                speed_mm_per_s=speed,
                 seed=seed,
                 link_path=link,
                 faults=Faults(bit_error_rate=flip_rate, byte_loss_rate=loss_rate),

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from drivers.errors import DriverError
+from scanner_service.analysis.errors import AnalysisError
 from scanner_service.api.answers import plain
 from scanner_service.api.keys import KeyStoreError
 from scanner_service.api.server import ServerError
@@ -28,6 +29,7 @@ console = Console(markup=False)  # what is told may hold brackets: paths, names,
 errors = Console(stderr=True, markup=False)
 EXPECTED = (
     httpx.HTTPError,
+    AnalysisError,
     DriverError,
     KeyStoreError,
     ServerError,
@@ -113,6 +115,35 @@ class ScanProgress:
         if not self._is_terminal and not self._quiet and done >= self._printed + 0.2:
             self._printed = done
             errors.print(f"{done:4.0%}  {facts}", highlight=False)
+
+
+@contextlib.contextmanager
+def work_progress(title: str, quiet: bool = False) -> "Iterator[WorkProgress]":
+    """A bar for work of several steps; on standard error, and silent on something that is no terminal."""
+    bar = Progress(
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TimeElapsedColumn(),
+        console=errors,
+        disable=quiet or not errors.is_terminal,
+        refresh_per_second=5,
+    )
+    with bar:
+        yield WorkProgress(bar, title)
+
+
+class WorkProgress:
+    """The bar of one piece of work, which says what is being done."""
+
+    def __init__(self, bar: Progress, title: str) -> None:
+        self._bar = bar
+        self._title = title
+        self._task = bar.add_task(title, total=1.0)
+
+    def show(self, what: str, share: float) -> None:
+        """Show what is being done, and the share of it that is done."""
+        self._bar.update(self._task, completed=share, description=f"{self._title}: {what}")
 
 
 def lost_lines(losses: Mapping[str, Any]) -> int:

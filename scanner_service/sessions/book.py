@@ -4,33 +4,63 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
 
-from scanner_service.sessions.errors import SessionBusy
+from scanner_service.sessions.calibration import calibration_of, geometry_from, towards_sensor_from
+from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SessionError
 from scanner_service.sessions.pass_desk import PassDesk
+from scanner_service.sessions.retention import OVER, Kept, Retention, choose
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec, SourceSpec
 from scanner_service.sessions.sources import PushSource, Source, SpentSource
+from scanner_service.sessions.withdrawals import SERVICE_ENDED
 from scanner_service.storage.errors import RecordError
-from scanner_service.storage.record import Record
-from scanner_service.storage.rows import SessionRow
+from scanner_service.storage.record import Record, utc_now
+from scanner_service.storage.rows import CreationKey, SessionRow
 
 _LOG = logging.getLogger(__name__)
 MAX_LIVE = 16
 
 
+@dataclass(slots=True)
+class Opening:
+    """A session whose map is being built from the record: lines taken of those there are."""
+
+    of: int
+    lines: int = 0
+    done: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def share(self) -> float:
+        """How much is done, 0 to 1."""
+        return min(1.0, self.lines / self.of) if self.of else 1.0
+
+
 class SessionBook:
     """All sessions of one record; those that somebody looks at are held open."""
 
-    def __init__(self, record: Record) -> None:
+    def __init__(
+        self,
+        record: Record,
+        retention: Retention | None = None,
+        clock: Callable[[], datetime] = utc_now,
+    ) -> None:
         self.record = record
+        self.retention = retention or Retention()
+        self._clock = clock
         self._live: dict[str, LiveSession] = {}
         self._desks: dict[str, tuple[LiveSession, PassDesk]] = {}
+        self._opening: dict[str, Opening] = {}
+        self._creating: set[str] = set()
+        self._failures: dict[str, str] = {}
         self._lock = threading.RLock()
         for row in self._all_rows():
             if row.state in ("scanning", "paused"):  # the service ended in the middle of it
                 try:
                     record.set_state(row.session_id, "interrupted")
+                    record.append_event(row.session_id, SERVICE_ENDED, {})
                 except RecordError as error:  # one damaged row must not keep all others from being served
                     _LOG.warning("session %s cannot be marked as interrupted: %s", row.session_id, error)
 
@@ -41,15 +71,45 @@ class SessionBook:
         settings: SessionSettings | None = None,
         origin_mm: Sequence[float] = (0.0, 0.0, 0.0),
         source: Source | None = None,
+        key: CreationKey | None = None,
     ) -> LiveSession:
         """Make a session and hold it open; `source` is the opened source when the caller has it already.
 
+        With a `key` that came before, the session that was made then; nothing is opened or made.
+
         Raises
         ------
-        SessionBusy : too many sessions are open.
+        SessionBusy : too many sessions are open, or the same request is being carried out.
+        BudgetSpent : the disk budget is used up.
         SourceUnusable, DriverError : the source cannot be opened; no session was made.
+        CreationKeyReused : the key came before, with another request.
         RecordError : the session could not be recorded.
         """
+        if key is None:
+            return self._create(name, spec, settings, origin_mm, source, None)
+        with self._lock:
+            if key.key_sha256 in self._creating:
+                raise SessionBusy("the same request is being carried out; ask again in a moment")
+            self._creating.add(key.key_sha256)
+        try:
+            made = self.record.made_with(key)
+            if made is not None:
+                return self.get(made.session_id)
+            return self._create(name, spec, settings, origin_mm, source, key)
+        finally:
+            with self._lock:
+                self._creating.discard(key.key_sha256)
+
+    def _create(
+        self,
+        name: str,
+        spec: SourceSpec,
+        settings: SessionSettings | None,
+        origin_mm: Sequence[float],
+        source: Source | None,
+        key: CreationKey | None,
+    ) -> LiveSession:
+        self.make_room_on_disk()
         with self._lock:
             self._make_room()
             opened = spec.open() if source is None else source
@@ -60,8 +120,13 @@ class SessionBook:
                     settings=(settings or SessionSettings()).to_dict(),
                     origin_mm=origin_mm,
                     source=spec.to_dict(),
+                    calibration=calibration_of(opened),
+                    key=key,
                 )
-                return self._hold(LiveSession(row, self.record, opened))
+                session = LiveSession(row, self.record, opened)
+                session.open()
+                self._live[row.session_id] = session
+                return session
             except BaseException:
                 opened.stop()
                 raise
@@ -69,22 +134,64 @@ class SessionBook:
     def get(self, session_id: str, on_progress: Callable[[int], None] = lambda lines: None) -> LiveSession:
         """The session, reopened from the record when nobody holds it open: the map is built from its lines.
 
+        Whoever asks for a session that is being reopened waits for it; nobody waits for another one.
+
         Raises
         ------
         SessionUnknown : there is none.
         SessionBusy : too many sessions are open.
         """
-        live = self._live.get(session_id)
-        if live is not None:  # nobody waits here for another session that is being reopened
-            return live
-        with self._lock:
+        while True:
             live = self._live.get(session_id)
-            if live is not None:
+            if live is not None:  # nobody waits here for a session that is being made
                 return live
-            row = self.record.get_session(session_id)
-            self._make_room()
-            source: Source = PushSource() if row.source.get("kind") == PushSpec().to_dict()["kind"] else SpentSource()
-            return self._hold(LiveSession(row, self.record, source), on_progress)
+            with self._lock:
+                live = self._live.get(session_id)
+                if live is not None:
+                    return live
+                opening = self._opening.get(session_id)
+                if opening is None:
+                    row = self.record.get_session(session_id)
+                    self._make_room()
+                    mine = self._opening[session_id] = Opening(self.record.count(session_id).lines)
+                    break
+            opening.done.wait()
+        try:
+            return self._reopen(row, mine, on_progress)
+        finally:
+            with self._lock:
+                del self._opening[session_id]
+            mine.done.set()
+
+    def _reopen(self, row: SessionRow, opening: Opening, on_progress: Callable[[int], None]) -> LiveSession:
+        def taken(number: int) -> None:
+            opening.lines = number + 1
+            on_progress(number)
+
+        is_push = row.source.get("kind") == PushSpec().to_dict()["kind"]
+        kept = row.calibration
+        source: Source = PushSource() if is_push else SpentSource(geometry_from(kept), towards_sensor_from(kept))
+        session = LiveSession(row, self.record, source)
+        session.open(taken)
+        with self._lock:
+            self._live[row.session_id] = session
+        return session
+
+    def open_quietly(self, session_id: str) -> None:
+        """Reopen a session; what keeps it from being opened is told by `failure_to_open`."""
+        self._failures.pop(session_id, None)
+        try:
+            self.get(session_id)
+        except (SessionError, RecordError) as error:
+            self._failures[session_id] = str(error)
+
+    def failure_to_open(self, session_id: str) -> str | None:
+        """Why the session could not be reopened when that was last tried; None when it could."""
+        return self._failures.get(session_id)
+
+    def opening(self, session_id: str) -> Opening | None:
+        """How far a session is that is being reopened; None when it is not."""
+        return self._opening.get(session_id)
 
     def pass_desk(self, session: LiveSession) -> PassDesk:
         """The desk where the session's recommended passes are ordered; made when it is first asked for."""
@@ -106,14 +213,53 @@ class SessionBook:
         """A page of the record's sessions, newest first."""
         return self.record.list_sessions(limit, after)
 
+    def describe(self, session_id: str, *, name: str | None = None, notes: str | None = None) -> SessionRow:
+        """Change the name or the notes of a session; raises SessionUnknown and what `Record.describe` does."""
+        row = self.record.describe(session_id, name=name, notes=notes)
+        live = self._live.get(session_id)
+        if live is not None:
+            live.row = replace(live.row, name=row.name, notes=row.notes)
+        return row
+
     def delete(self, session_id: str) -> None:
         """Stop and delete a session with everything stored of it; raises SessionUnknown."""
+        opening = self._opening.get(session_id)
+        if opening is not None:
+            opening.done.wait()
         with self._lock:
             live = self._live.pop(session_id, None)
             self._desks.pop(session_id, None)
             if live is not None:
                 live.close()
             self.record.delete_session(session_id)
+
+    def make_room_on_disk(self) -> list[tuple[str, str]]:
+        """Delete what the retention says; the sessions deleted, with the reason.
+
+        Raises BudgetSpent when the budget is exceeded and nothing more may be deleted.
+        """
+        if self.retention.is_unlimited:
+            return []
+        kept = [
+            Kept(
+                row.session_id,
+                datetime.fromisoformat(row.created_utc),
+                self.record.session_bytes(row.session_id),
+                may_go=row.state in OVER and row.session_id not in self._live,
+            )
+            for row in self._all_rows()
+            if not row.damaged
+        ]
+        choice = choose(self.retention, kept, self._clock())
+        for session_id, reason in choice.deleted:
+            _LOG.warning("session %s was deleted: %s", session_id, reason)
+            self.delete(session_id)
+        if choice.over_bytes:
+            raise BudgetSpent(
+                f"the disk budget is exceeded by {choice.over_bytes / 1e6:.1f} MB, and no session may be deleted for "
+                "it by itself: delete sessions, or raise the budget"
+            )
+        return list(choice.deleted)
 
     def close(self) -> None:
         """Stop and close all sessions; the record stays open."""
@@ -122,17 +268,12 @@ class SessionBook:
                 stack.callback(live.close)
             self._live = {}
 
-    def _hold(self, session: LiveSession, on_progress: Callable[[int], None] = lambda lines: None) -> LiveSession:
-        session.open(on_progress)
-        self._live[session.row.session_id] = session
-        return session
-
     def _make_room(self) -> None:
         """Close the session that was opened first among those that do not scan."""
-        if len(self._live) < MAX_LIVE:
+        if len(self._live) + len(self._opening) < MAX_LIVE:
             return
         for session_id, session in self._live.items():
-            if session.state in ("stopped", "failed", "interrupted"):
+            if session.state in OVER:
                 session.close()
                 del self._live[session_id]
                 self._desks.pop(session_id, None)

@@ -77,9 +77,10 @@ class Engine:
         """Hand over a scanline, or one out of a record; waits while the inbox is full, so that the source holds it."""
         if reply is not None:
             reply.set_running_or_notify_cancel()  # what is in the inbox cannot be called back
-        self.ledger.arrived()
+        key = _pass_of(line)
+        self.ledger.arrived(key)
         if not self._hand_over(_Line(line, reply)):
-            self.ledger.decided("too_late")
+            self.ledger.decided("too_late", key)
             raise SessionNotLive(self.failure or "the session is closed and takes no scanlines")
 
     def ask(self, question: "Callable[[Engine], T]") -> "Future[T]":
@@ -107,8 +108,6 @@ class Engine:
         """Take a line that is in the record already; before `start` only."""
         self._close_pass_before(line)
         self._enter(line)
-        self.ledger.arrived()
-        self.ledger.decided("stored")
 
     def withdraw_pass(self, key: PassKey) -> int:
         """Take a pass out of the map; returns how many points that were."""
@@ -166,13 +165,18 @@ class Engine:
                 self._refuse(message, "map_full" if isinstance(error, MapFull) else "too_many_passes", str(error))
                 return
         try:
-            stored = self._record.append(self.session_id, line, timeout_s=_RECORD_PATIENCE_S)
+            stored = self._record.append(self.session_id, line, timeout_s=self._patience_s())
         except RecordError as error:
             self._refuse(message, "record_busy" if isinstance(error, RecordBusy) else "record_closed", str(error))
             return
-        stored.add_done_callback(lambda done: self._committed(done, message.reply))
+        taken = line
+        stored.add_done_callback(lambda done: self._committed(done, taken, message.reply))
         if key not in self._seen:
             self._enter(line)
+
+    def _patience_s(self) -> float:
+        """How long a line waits for room: a slow disk is waited for; on one that fails, the rest is counted at once."""
+        return 0.0 if self._record.writer_state().state == "failing" else _RECORD_PATIENCE_S
 
     def _close_pass_before(self, line: StoredLine) -> None:
         """The first line of a pass ends the device's pass before it."""
@@ -186,14 +190,15 @@ class Engine:
         self.ledger.mapped(line, self.live_map.add(line))
 
     def _refuse(self, message: _Line, reason: str, text: str) -> None:
-        self.ledger.decided(reason)
+        self.ledger.decided(reason, _pass_of(message.line))
         if message.reply is not None:
             message.reply.set_exception(LineRefused(reason, text))
 
-    def _committed(self, done: "Future[Stored]", reply: "Future[Stored] | None") -> None:
+    def _committed(self, done: "Future[Stored]", line: StoredLine, reply: "Future[Stored] | None") -> None:
         """On the record's writer: the line is durable, or will never be."""
         error = done.exception()
-        self.ledger.decided(done.result().outcome if error is None else "not_stored")
+        outcome = done.result().outcome if error is None else "not_stored"
+        self.ledger.decided(outcome, pass_key(line), is_partial(line))
         if reply is not None:
             if error is None:
                 reply.set_result(done.result())
@@ -211,3 +216,12 @@ class Engine:
                 self._refuse(message, "too_late", self.failure or "the session was closed before the line's turn came")
             elif isinstance(message, _Ask) and message.reply.set_running_or_notify_cancel():
                 message.reply.set_exception(SessionNotLive(self.failure or "the session is closed"))
+
+
+def is_partial(line: StoredLine) -> bool:
+    """True when a piece of the line never arrived."""
+    return bool(line.dropped.get("missing"))
+
+
+def _pass_of(line: Scanline | StoredLine) -> PassKey:
+    return (line.device_id, line.boot_id, line.pass_index)

@@ -4,8 +4,12 @@ SessionError
 ├── SessionNotLive      the session is in the record, but not open
 ├── SessionBusy         the request does not fit the session's state
 ├── PassUnknown         no such recommended or accepted pass
+├── BudgetSpent         the disk budget is used up, and no session may be deleted to make room
 ├── SourceUnusable      what the session should read from cannot be read
-└── LineRefused         one scanline was not taken in, for the reason told
+├── LineRefused         one scanline was not taken in, for the reason told
+├── AnalysisUnknown     there is no analysis of that id, or its room was needed
+├── AnalysisNotDone     the analysis has no result: it waits, runs or has failed
+└── AnalysesBusy        as many analyses as may wait are waiting
 """
 
 
@@ -25,6 +29,10 @@ class PassUnknown(SessionError):
     """There is no recommended or accepted pass of that number."""
 
 
+class BudgetSpent(SessionError):
+    """The disk budget is used up, and no session may be deleted to make room."""
+
+
 class SourceUnusable(SessionError):
     """What the session should read from cannot be read."""
 
@@ -35,3 +43,15 @@ class LineRefused(SessionError):
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
         self.reason = reason
+
+
+class AnalysisUnknown(SessionError):
+    """There is no analysis of that id, or its room was needed."""
+
+
+class AnalysisNotDone(SessionError):
+    """The analysis has no result: it waits, runs or has failed."""
+
+
+class AnalysesBusy(SessionError):
+    """As many analyses as may wait are waiting."""

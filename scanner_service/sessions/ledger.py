@@ -6,16 +6,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from drivers.tally import PassTally
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.live_map import Accepted
+from scanner_service.analysis.passes import PassKey
+from scanner_service.sessions.pass_accounts import (
+    SERVICE_ENDED,
+    LineFates,
+    PassAccount,
+    account_of,
+    after_a_restart,
+    read_accounts,
+)
 
 
 @dataclass(slots=True)
 class Ledger:
-    """Two balances that hold at any moment.
+    """Three balances that hold at any moment.
 
     lines:  received = pending + stored + duplicates + conflicts + refused, by reason
     points: places of the lines in the map = counted + dropped, by reason + left out, by reason
+    passes: sent = stored + under way + lost, by reason, for each pass of each device (`pass_accounts.py`)
 
     The engine writes the points and the arrivals, the record's answers come from its writer: hence the lock.
     """
@@ -30,26 +41,57 @@ class Ledger:
     counted: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
     left_out: Counter[str] = field(default_factory=Counter)
+    _fates: dict[PassKey, LineFates] = field(default_factory=dict)
+    _earlier: dict[PassKey, PassAccount] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def arrived(self) -> None:
-        """A line came in and waits for its fate."""
+    def arrived(self, key: PassKey) -> None:
+        """A line of a pass came in and waits for its fate."""
         with self._lock:
             self.received += 1
             self.pending += 1
+            fates = self._fates.setdefault(key, LineFates())
+            fates.received += 1
+            fates.pending += 1
 
-    def decided(self, outcome: str) -> None:
+    def decided(self, outcome: str, key: PassKey, is_partial: bool = False) -> None:
         """A line's fate: `stored`, `duplicate`, `conflict`, or the reason for which it was refused."""
         with self._lock:
             self.pending -= 1
+            fates = self._fates[key]
+            fates.pending -= 1
             if outcome == "stored":
                 self.stored += 1
+                fates.stored += 1
+                fates.partial += is_partial
             elif outcome == "duplicate":
                 self.duplicates += 1
-            elif outcome == "conflict":
-                self.conflicts += 1
+                fates.duplicates += 1
             else:
-                self.refused[outcome] += 1
+                fates.lost[outcome] += 1
+                if outcome == "conflict":
+                    self.conflicts += 1
+                else:
+                    self.refused[outcome] += 1
+
+    def reopened(
+        self, kept: Mapping[str, Any] | None, stored: Mapping[PassKey, int], partial: Mapping[PassKey, int]
+    ) -> None:
+        """Go on from what the record holds of each pass, and from the account that was kept last, if there is one."""
+        with self._lock:
+            accounts = read_accounts(kept["passes"]) if kept is not None else {}
+            for key in dict.fromkeys((*accounts, *stored)):
+                account = after_a_restart(accounts.get(key), stored.get(key, 0), partial.get(key, 0))
+                self._earlier[key] = account
+                self.stored += account.stored
+                if account.lost.get(SERVICE_ENDED):
+                    self.refused[SERVICE_ENDED] += account.lost[SERVICE_ENDED]
+            if kept is not None:
+                lines = kept["lines"]
+                self.duplicates, self.conflicts = lines["duplicates"], lines["conflicts"]
+                earlier = {reason: count for reason, count in lines["refused"].items() if reason != SERVICE_ENDED}
+                self.refused.update(earlier)
+            self.received = self.stored + self.duplicates + self.conflicts + sum(self.refused.values())
 
     def mapped(self, line: StoredLine, accepted: Accepted) -> None:
         """A line went into the map."""
@@ -65,8 +107,21 @@ class Ledger:
             self.counted -= points
             self.left_out["withdrawn"] += points
 
-    def to_dict(self, device: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    def passes(self, wire: Mapping[PassKey, PassTally] | None = None) -> dict[PassKey, PassAccount]:
+        """The account of every pass; `wire` is the driver's own of those that came over one."""
+        wire = wire or {}
+        with self._lock:
+            accounts = dict(self._earlier)
+            for key in dict.fromkeys((*self._fates, *wire)):
+                account = account_of(self._fates.get(key, LineFates()), wire.get(key))
+                accounts[key] = accounts[key] + account if key in accounts else account
+        return accounts
+
+    def to_dict(
+        self, device: Mapping[str, Any] | None = None, wire: Mapping[PassKey, PassTally] | None = None
+    ) -> dict[str, Any]:
         """As the API, the summary and the viewer show it; `device` is the driver's own tally of chunks and lines."""
+        passes = [account.to_dict(key) for key, account in self.passes(wire).items()]
         with self._lock:
             return {
                 "lines": {
@@ -83,5 +138,6 @@ class Ledger:
                     "dropped": dict(sorted(self.dropped.items())),
                     "left_out": dict(sorted(self.left_out.items())),
                 },
+                "passes": passes,
                 "device": dict(device) if device is not None else None,
             }

@@ -1,6 +1,7 @@
 """The four files a scan leaves: points.ply, density.png, regions.json, summary.json; computes nothing new."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,43 +9,66 @@ from scanner_service import __version__
 from scanner_service.sessions.errors import SessionError
 from scanner_service.sessions.results import Results, summarise
 from scanner_service.sessions.session import LiveSession
+from scanner_service.sessions.stored import StoredSession
 from scanner_service.storage.exports.density_png import density_png
 from scanner_service.storage.exports.points_ply import write_points_ply
 from scanner_service.storage.exports.results_json import write_json
 from scanner_service.storage.exports.whole_file import write_whole
+from scanner_service.storage.rows import SessionRow
 
 
-def summary_of(session: LiveSession, results: Results) -> dict[str, Any]:
-    """The content of summary.json."""
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What the files tell of, be the session held open or read from the record; `points_per_s` may be NaN."""
+
+    row: SessionRow
+    state: str
+    results: Results
+    losses: Mapping[str, Any]
+    points_per_s: float
+
+
+def outcome_of(session: LiveSession, results: Results) -> Outcome:
+    """Of a session that is held open."""
     status = session.status()
-    head = {"session": session.row.session_id, "name": session.row.name, "state": status.state}
-    return head | summarise(results, status.losses, status.points_per_s, __version__)
+    return Outcome(session.row, status.state, results, status.losses, status.points_per_s)
 
 
-def _points(path: Path, session: LiveSession, results: Results) -> None:
-    write_points_ply(path, results.snapshot, results.verdict.rescan, version=__version__)
+def stored_outcome(stored: StoredSession) -> Outcome:
+    """Of a session that was read from the record, which does not tell how long it took."""
+    return Outcome(stored.row, stored.row.state, stored.results, stored.losses, float("nan"))
 
 
-def _density(path: Path, session: LiveSession, results: Results) -> None:
+def summary_of(outcome: Outcome) -> dict[str, Any]:
+    """The content of summary.json."""
+    head = {"session": outcome.row.session_id, "name": outcome.row.name, "state": outcome.state}
+    return head | summarise(outcome.results, outcome.losses, outcome.points_per_s, __version__)
+
+
+def _points(path: Path, outcome: Outcome) -> None:
+    write_points_ply(path, outcome.results.snapshot, outcome.results.verdict.rescan, version=__version__)
+
+
+def _density(path: Path, outcome: Outcome) -> None:
     picture = density_png(
-        results.snapshot,
-        results.report.regions,
-        session_name=session.row.name,
-        when=session.row.created_utc[:16].replace("T", " ") + " UTC",
-        coverage=results.coverage.share,
+        outcome.results.snapshot,
+        outcome.results.report.regions,
+        session_name=outcome.row.name,
+        when=outcome.row.created_utc[:16].replace("T", " ") + " UTC",
+        coverage=outcome.results.coverage.share,
     )
     write_whole(path, picture)
 
 
-def _regions(path: Path, session: LiveSession, results: Results) -> None:
-    write_json(path, {"session": session.row.session_id, **results.report.to_dict()})
+def _regions(path: Path, outcome: Outcome) -> None:
+    write_json(path, {"session": outcome.row.session_id, **outcome.results.report.to_dict()})
 
 
-def _summary(path: Path, session: LiveSession, results: Results) -> None:
-    write_json(path, summary_of(session, results))
+def _summary(path: Path, outcome: Outcome) -> None:
+    write_json(path, summary_of(outcome))
 
 
-_WRITERS: dict[str, Callable[[Path, LiveSession, Results], None]] = {
+_WRITERS: dict[str, Callable[[Path, Outcome], None]] = {
     "points.ply": _points,
     "density.png": _density,
     "regions.json": _regions,
@@ -53,9 +77,9 @@ _WRITERS: dict[str, Callable[[Path, LiveSession, Results], None]] = {
 OUTPUT_FILES = tuple(_WRITERS)
 
 
-def write_output(name: str, path: Path, session: LiveSession, results: Results) -> None:
+def write_output(name: str, path: Path, outcome: Outcome) -> None:
     """Write one of OUTPUT_FILES to `path`; raises OSError when the place cannot be written to."""
-    _WRITERS[name](path, session, results)
+    _WRITERS[name](path, outcome)
 
 
 def write_outputs(folder: Path, session: LiveSession) -> dict[str, Any]:
@@ -69,7 +93,8 @@ def write_outputs(folder: Path, session: LiveSession) -> dict[str, Any]:
     results = session.results()
     if results is None:
         raise SessionError("the session has nothing to write yet: stop it first")
+    outcome = outcome_of(session, results)
     folder.mkdir(parents=True, exist_ok=True)
     for name in OUTPUT_FILES:
-        write_output(name, folder / name, session, results)
-    return summary_of(session, results)
+        write_output(name, folder / name, outcome)
+    return summary_of(outcome)

@@ -3,8 +3,8 @@
 import logging
 import threading
 import time
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
@@ -14,29 +14,36 @@ import numpy as np
 from drivers.scanline import Scanline
 from scanner_service.analysis.errors import AnalysisError
 from scanner_service.analysis.intake import StoredLine
-from scanner_service.analysis.passes import PassKey
-from scanner_service.sessions.engine import Engine
+from scanner_service.analysis.passes import PassKey, pass_key
+from scanner_service.sessions.engine import Engine, is_partial
 from scanner_service.sessions.errors import SessionBusy, SessionError
+from scanner_service.sessions.ledger import Ledger
 from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.settings import SessionSettings
-from scanner_service.sessions.sources import PushSource, Source
+from scanner_service.sessions.sources import OnAWire, Pausable, PushSource, Source, SpentSource
 from scanner_service.sessions.updates import Changes, PointPage, VerdictBook, changes_since, read_page
-from scanner_service.sessions.withdrawals import WITHDRAWN, withdrawn_passes
+from scanner_service.sessions.withdrawals import SCAN_ENDED, WITHDRAWN, ends_of_passes, withdrawn_passes
 from scanner_service.storage.errors import RecordError
 from scanner_service.storage.record import Record
-from scanner_service.storage.rows import SessionRow, Stored
+from scanner_service.storage.rows import SessionRow, Stored, WriterState
 
 _LOG = logging.getLogger(__name__)
 ANALYSIS_PERIOD_S = 1.0
 """Regions are looked for about this often during a scan, and less often when one search takes long."""
+
+_STATE_PATIENCE_S = 2.0
 
 STATES = ("created", "scanning", "paused", "interrupted", "stopped", "failed")
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What a session is doing, for people: counts, rates, losses and, when something is amiss, one sentence."""
+    """What a session is doing, for people: counts, rates, losses and, when something is amiss, one sentence.
+
+    `lines` and `points`: stored in the record, and counted in the map. `held`: a pause that lasts until somebody
+    resumes it.
+    """
 
     session_id: str
     name: str
@@ -50,6 +57,7 @@ class Status:
     losses: dict[str, Any]
     durable: dict[str, dict[str, int]]
     message: str | None
+    held: bool
 
 
 class LiveSession:
@@ -77,6 +85,11 @@ class LiveSession:
         self._lock = threading.RLock()
         self._begun_s: float | None = None
         self._ended_s: float | None = None
+        self._earlier_s = 0.0  # of scanning before this session was reopened, or started again
+        self._held = False
+        self._kept: Mapping[str, Any] | None = None  # the account of losses that was written last
+        self._disk = _DiskWatch()
+        self._owed: deque[tuple[str, dict[str, Any]]] = deque(maxlen=1000)  # events that a failing disk did not take
         self._closing = threading.Event()
         self._analyst = threading.Thread(target=self._analyse, name=f"analyst-{row.session_id}", daemon=True)
 
@@ -92,19 +105,32 @@ class LiveSession:
         """
         warm_up()
         damaged: list[str] = []
+        events = list(self._record.events(self.row.session_id))
+        ends = ends_of_passes(events)
+        partial: Counter[PassKey] = Counter()
         for number, line in self._record.lines(
             self.row.session_id, on_damage=lambda found: damaged.append(found.reason)
         ):
+            while ends and ends[0] <= number:
+                self.engine.close_passes()
+                ends.pop(0)
             try:
                 self.engine.restore(line)
             except (AnalysisError, ValueError) as error:
                 damaged.append(f"line {number}: {error}")
+            partial[pass_key(line)] += is_partial(line)
             on_progress(number)
-        for key in withdrawn_passes(self._record.events(self.row.session_id)):
+        for key in withdrawn_passes(events):
             self.engine.withdraw_pass(key)
+        kept = self._record.ledger(self.row.session_id)
+        self.engine.ledger.reopened(kept, self._record.lines_of_passes(self.row.session_id), partial)
+        if kept is not None:
+            self._kept, self._earlier_s = kept, float(kept.get("elapsed_s") or 0.0)
+            if isinstance(self.source, SpentSource):
+                self.source.remember(kept.get("device"))
         if damaged:
             self._message = f"{len(damaged)} stored lines are left out; the first: {damaged[0]}"
-        if self._state in ("stopped", "failed", "interrupted"):
+        if ends or self._state in ("stopped", "failed", "interrupted"):
             self.engine.close_passes()
         self.engine.start()
         self._analyst.start()
@@ -122,9 +148,12 @@ class LiveSession:
         with self._lock:
             if self._state == "scanning":
                 raise SessionBusy("the session is scanning already")
+            if self._state == "paused":
+                raise SessionBusy("the session is paused: resume it")
             if self._state != "created" and not isinstance(self.source, PushSource):
                 raise SessionBusy(f"the session is {self._state}; create another one to scan again")
             before, self._state = self._state, "scanning"  # a short source may end before its start returns
+            self._earlier_s = self.elapsed_s()
             self._begun_s, self._ended_s = self._clock(), None
             try:
                 self.source.start(self)
@@ -172,7 +201,8 @@ class LiveSession:
             raise SessionBusy("this session reads from a source of its own and takes no pushed scanlines")
         with self._lock:  # a line is before the end of the scan, and judged, or refused
             if self._state != "scanning":
-                raise SessionBusy(f"the session is {self._state}: start it before pushing scanlines")
+                verb = "resume" if self._state == "paused" else "start"
+                raise SessionBusy(f"the session is {self._state}: {verb} it before pushing scanlines")
             reply: Future[Stored] = Future()
             self._latest.append((line, self._clock()))
             self.engine.put(line, reply)
@@ -191,6 +221,56 @@ class LiveSession:
         count = self.engine.ask(lambda engine: engine.withdraw_pass(key)).result()
         self._judge()
         return count
+
+    @property
+    def can_pause(self) -> bool:
+        """True for a source that can be held and go on."""
+        return isinstance(self.source, Pausable)
+
+    def pause(self) -> None:
+        """Hold the scan until `resume`: stage and laser of a device stop.
+
+        Raises
+        ------
+        SessionBusy : the session is not scanning, or its source cannot be held.
+        DriverError : the device does not obey; the session scans on.
+        """
+        with self._lock:
+            if self._state != "scanning":
+                raise SessionBusy(f"the session is {self._state}: only one that scans can be paused")
+            if not isinstance(self.source, Pausable):
+                raise SessionBusy("the source of this session cannot be paused: stop it")
+            self._held = True  # lines that are still on their way must not look like a scanner that came back
+            try:
+                self.source.pause()
+            except BaseException:
+                self._held = False
+                raise
+            if self._state != "scanning":  # it ended meanwhile
+                self._held = False
+                return
+            self._pass_time()
+            self._event("paused", {})
+            self._message = "paused; resume it to go on"
+            self._set_state("paused")
+
+    def resume(self) -> None:
+        """Go on after a pause, or after an interruption that was too long to go on by itself; the laser is switched on.
+
+        Raises
+        ------
+        SessionBusy : there is nothing to resume.
+        DriverError : the device does not do it; the session stays paused.
+        """
+        with self._lock:
+            if self._state != "paused":
+                raise SessionBusy(f"the session is {self._state}: only one that is paused can be resumed")
+            if not self._held or not isinstance(self.source, Pausable):
+                raise SessionBusy("the scanner is gone; the session goes on, or can be resumed, when it is back")
+            self.source.resume()
+            self._held = False
+            self._begun_s = self._clock()
+            self.note("resumed", {"by": "request"})
 
     def stop(self) -> None:
         """End the scan: close the source and the passes, judge what there is; idempotent."""
@@ -212,7 +292,7 @@ class LiveSession:
 
     def line(self, line: Scanline | StoredLine) -> None:
         """A scanline from the source; when the engine is gone, it is counted there and the source is told to stop."""
-        if self._state == "paused":  # lines flow again, whatever was or was not said of the link
+        if self._state == "paused" and not self._held:  # lines flow again, whatever was or was not said of the link
             self.note("resumed", {})
         if isinstance(line, Scanline):
             self._latest.append((line, self._clock()))
@@ -228,7 +308,15 @@ class LiveSession:
         if kind == "interrupted":
             self._message = f"the scanner is gone ({details.get('reason')}); waiting for it to return"
             self._set_state("paused")
-        elif kind == "resumed":
+        elif kind == "held":
+            self._held = True
+            self._pass_time()
+            self._message = (
+                "the pass was interrupted for too long to go on by itself, and the laser is off: "
+                f"resume it to go on at {details.get('from_mm')} mm, or stop it"
+            )
+            self._set_state("paused")
+        elif kind == "resumed" and not self._held:
             self._message = None
             self._set_state("scanning")
 
@@ -272,14 +360,16 @@ class LiveSession:
             return self._results_changed.wait_for(lambda: self._state in ("stopped", "failed"), timeout_s)
 
     def elapsed_s(self) -> float:
-        """Seconds from the start of the scan to its end, or to now."""
+        """Seconds of scanning, over all starts of the session and without its pauses."""
         if self._begun_s is None:
-            return 0.0
-        return (self._ended_s if self._ended_s is not None else self._clock()) - self._begun_s
+            return self._earlier_s
+        return self._earlier_s + (self._ended_s if self._ended_s is not None else self._clock()) - self._begun_s
 
     def losses(self) -> dict[str, Any]:
-        """The whole ledger: lines, points, and what the driver counted on the wire."""
-        return self.engine.ledger.to_dict(self.source.tally())
+        """The whole ledger: lines, points, each pass, and what the driver counted on the wire."""
+        source = self.source
+        wire = source.pass_tallies() if isinstance(source, OnAWire) else None
+        return self.engine.ledger.to_dict(source.tally(), wire)
 
     def status(self) -> Status:
         """What the session is doing now."""
@@ -295,14 +385,15 @@ class LiveSession:
             name=self.row.name,
             state=self._state,
             created_utc=self.row.created_utc,
-            lines=ledger.received,
+            lines=ledger.stored,
             points=ledger.counted,
             points_per_s=ledger.counted / elapsed if elapsed > 0 else 0.0,
             coverage=results.coverage.share if results is not None else float("nan"),
             progress=self.source.progress(),
             losses=self.losses(),
             durable=durable,
-            message=self.engine.failure or self._message,
+            message=self.engine.failure or self._disk.message(self._record.writer_state()) or self._message,
+            held=self._held,
         )
 
     # -- inside -------------------------------------------------------------------------------------------------
@@ -319,9 +410,12 @@ class LiveSession:
                 self.engine.ask(lambda engine: engine.close_passes()).result()
             except SessionError as error:
                 failure = failure or str(error)
-            self._ended_s = self._clock()
+            if not self._held:
+                self._ended_s = self._clock()
+            self._held = False
             self._judge()
-            self._event("losses", self.losses())
+            self._event(SCAN_ENDED, self.losses(), patience_s=5.0)
+            self._keep_ledger()
             if failure is not None or self._state == "paused":
                 self._message = failure  # a scan that is over waits for nothing
             self._set_state("failed" if failure is not None else "stopped")
@@ -335,6 +429,8 @@ class LiveSession:
         while not self._closing.wait(period_s):
             begun_s = self._clock()
             try:
+                self._watch_the_disk()
+                self._keep_ledger()
                 if self._state in ("scanning", "paused") or self._results is None:
                     results = self._judge(unless=seen)
                     seen = results.snapshot.version if results is not None else seen
@@ -361,15 +457,74 @@ class LiveSession:
             self._results_changed.notify_all()
         return results
 
-    def _event(self, kind: str, details: dict[str, Any]) -> None:
+    def _pass_time(self) -> None:
+        """The clock of the scan stands still from here on."""
+        self._earlier_s, self._begun_s = self.elapsed_s(), None
+
+    def _keep_ledger(self) -> None:
+        """Write the account of losses into the record when it has changed: a killed service leaves the last one."""
+        account = self.losses()
+        if self._kept is not None and {**self._kept, "elapsed_s": 0.0} == {**account, "elapsed_s": 0.0}:
+            return
+        account["elapsed_s"] = self.elapsed_s()
         try:
-            self._record.append_event(self.row.session_id, kind, details, timeout_s=1.0)
+            self._record.save_ledger(self.row.session_id, account)
         except RecordError:
-            _LOG.warning("the event %s of session %s could not be recorded", kind, self.row.session_id)
+            return  # the disk is failing: it is kept when that is over
+        self._kept = account
+
+    def _watch_the_disk(self) -> None:
+        """Tell in the record, once it can be written again, what it missed, and that it could not be."""
+        if self._owed and self._record.writer_state().state == "ok":
+            self._event(*self._owed.popleft())
+        told = self._disk.look(self._record.writer_state(), self.engine.ledger, self._clock())
+        if told is not None:
+            self._event("record_resumed", told)
+
+    def _event(self, kind: str, details: dict[str, Any], patience_s: float = 1.0) -> None:
+        try:
+            self._record.append_event(self.row.session_id, kind, details, timeout_s=patience_s)
+        except RecordError:
+            _LOG.warning("the event %s of session %s will be recorded later", kind, self.row.session_id)
+            self._owed.append((kind, details))
 
     def _set_state(self, state: str) -> None:
         self._state = state
         try:
-            self._record.set_state(self.row.session_id, state)
-        except (RecordError, TimeoutError) as error:
+            self._record.change_state(self.row.session_id, state).result(_STATE_PATIENCE_S)
+        except TimeoutError:  # the disk is failing, the scan goes on meanwhile
+            _LOG.warning("the state %s of session %s will be recorded later", state, self.row.session_id)
+        except RecordError as error:
             _LOG.warning("the state of session %s could not be recorded: %s", self.row.session_id, error)
+
+
+class _DiskWatch:
+    """What a session tells of a record that cannot be written; owned by its analyst, read by whoever asks."""
+
+    def __init__(self) -> None:
+        self._since_s: float | None = None
+        self._refused_before = 0
+
+    def look(self, writer: WriterState, ledger: Ledger, now_s: float) -> dict[str, Any] | None:
+        """How long the record failed and how many lines it cost, once it is over; else None."""
+        refused = ledger.refused["record_busy"]
+        if writer.state == "failing":
+            if self._since_s is None:
+                self._since_s = now_s
+            return None
+        if self._since_s is None:
+            self._refused_before = refused
+            return None
+        told = {"failed_for_s": round(now_s - self._since_s, 3), "lines_lost": refused - self._refused_before}
+        self._since_s, self._refused_before = None, refused
+        return told
+
+    @staticmethod
+    def message(writer: WriterState) -> str | None:
+        """One sentence while the record cannot be written."""
+        if writer.state != "failing":
+            return None
+        return (
+            f"the record cannot be written ({writer.reason}): {writer.waiting_lines} lines wait in memory and "
+            f"{writer.refused} were lost; free space on its disk, and it goes on by itself"
+        )

@@ -6,9 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from drivers.rig import Rig
+from drivers.rig_file import read_rig
+from drivers.rig_limits import PassOrder
+from drivers.running_rig import RunningRig
 from drivers.scanners.native import NativeScanner
 from scanner_service.analysis.passes import pass_key
 from scanner_service.sessions.errors import SourceUnusable
+from scanner_service.sessions.rig_source import Preparation, RigSource
 from scanner_service.sessions.sources import DeviceSource, PassRequest, PushSource, ReplaySource, Source
 from scanner_service.sessions.withdrawals import withdrawn_passes
 from scanner_service.storage.formats import ReadOptions, Recording, open_recording
@@ -20,7 +24,10 @@ _PORT_PREFIXES = ("/dev/tty", "/dev/pts/", "/dev/serial/", "/dev/cu.")
 
 @dataclass(frozen=True, slots=True)
 class DeviceSpec:
-    """One pass of a native scanner: the port and its rate, and the pass from `start_mm` to `end_mm` of the stage."""
+    """One pass of a native scanner: the port and its rate, and the pass from `start_mm` to `end_mm` of the stage.
+
+    `rearm`: see `PassRequest`.
+    """
 
     port: str
     baud_rate: int
@@ -28,6 +35,7 @@ class DeviceSpec:
     start_mm: float
     end_mm: float
     line_rate_hz: float
+    rearm: bool = False
 
     def __post_init__(self) -> None:
         numbers = (self.line_spacing_mm, self.start_mm, self.end_mm, self.line_rate_hz)
@@ -53,12 +61,49 @@ class DeviceSpec:
             raise SourceUnusable(f"{self.port} is not a serial device: name one such as /dev/ttyUSB0")
         scanner = NativeScanner(self.port, self.baud_rate)
         info = scanner.enter()
-        request = PassRequest(self.line_spacing_mm, self.start_mm, self.end_mm, self.line_rate_hz)
+        request = PassRequest(self.line_spacing_mm, self.start_mm, self.end_mm, self.line_rate_hz, self.rearm)
         return DeviceSource(scanner, rig or Rig(), request, info)
 
     def to_dict(self) -> dict[str, Any]:
         """As it is kept in the record."""
         return {"kind": "device", **asdict(self)}
+
+
+@dataclass(frozen=True, slots=True)
+class RigSpec:
+    """One pass of a rig whose file lies in the service's own folder of rigs, or that the operator of the machine names.
+
+    `speed_mm_per_s` None takes the fastest that keeps the line spacing, 0 measures each line at rest.
+    """
+
+    file: Path
+    line_spacing_mm: float
+    start_mm: float
+    end_mm: float
+    speed_mm_per_s: float | None = None
+    home: bool = False
+    at_mm: float | None = None
+
+    def order(self) -> PassOrder:
+        """The pass; raises SourceUnusable when its numbers are none of a pass."""
+        try:
+            speed = math.nan if self.speed_mm_per_s is None else self.speed_mm_per_s
+            return PassOrder(self.start_mm, self.end_mm, self.line_spacing_mm, speed)
+        except ValueError as error:
+            raise SourceUnusable(str(error)) from None
+
+    def open(self) -> Source:
+        """Read the file, open both ports and greet both devices; raises SourceUnusable or a DriverError."""
+        order, description = self.order(), read_rig(self.file)
+        why = description.limits.why_not(self.start_mm, self.end_mm)
+        if why is not None:
+            raise SourceUnusable(f"{why}; choose other ends, or correct the rig file")
+        rig = RunningRig(description)
+        return RigSource(rig, order, rig.enter(), Preparation(self.home, self.at_mm))
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it is kept in the record."""
+        return {"kind": "rig", **asdict(self), "file": self.file.name}
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,4 +174,4 @@ class PushSpec:
         return {"kind": "push"}
 
 
-SourceSpec = DeviceSpec | ReplaySpec | RecordSpec | PushSpec
+SourceSpec = DeviceSpec | RigSpec | ReplaySpec | RecordSpec | PushSpec

@@ -8,14 +8,16 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from drivers.errors import DriverError
 from drivers.protocols.scanner_events import (
+    Advice,
+    ClockJumped,
     Disconnected,
     OtherDevice,
     PassEnded,
@@ -23,11 +25,15 @@ from drivers.protocols.scanner_events import (
     PassResumed,
     Rebooted,
     Reconnected,
+    ScannerEvent,
 )
 from drivers.rig import Rig
 from drivers.scanline import DeviceInfo, Float64Array, Profile, Scanline, SensorGeometry
-from drivers.scanners.native import Happening, NativeScanner
+from drivers.scanners.face import Happening
+from drivers.scanners.native import NativeScanner
+from drivers.tally import PassTally
 from scanner_service.analysis.intake import StoredLine
+from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.storage.errors import RecordError
 
@@ -41,7 +47,11 @@ class Sink(Protocol):
         """A scanline, or one out of a record; waits while the session is busy."""
 
     def note(self, kind: str, details: dict[str, Any]) -> None:
-        """Something happened: `interrupted`, `reconnected`, `resumed`, `not_resumed`, `rebooted`, `pass_ended`."""
+        """Something happened: `interrupted`, `held`, `reconnected`, `resumed`, `not_resumed`, `rebooted`,
+        `clock_jumped`, `advice`, `pass_ended`.
+
+        `held`: the source goes on only when its `resume` is called.
+        """
 
     def ended(self, failure: str | None) -> None:
         """Nothing more will come; `failure` says why when that was not planned."""
@@ -70,14 +80,38 @@ class Source(Protocol):
         """Share of the work that is done, None when the end is not known."""
 
 
+@runtime_checkable
+class Pausable(Protocol):
+    """A source that can be held and go on."""
+
+    def pause(self) -> None:
+        """Deliver nothing more until `resume`; raises a DriverError when the device does not obey."""
+
+    def resume(self) -> None:
+        """Go on where it was held; raises a DriverError when that cannot be done: it is held still."""
+
+
+@runtime_checkable
+class OnAWire(Protocol):
+    """A source whose driver keeps an account of each pass."""
+
+    def pass_tallies(self) -> Mapping[PassKey, PassTally]:
+        """Chunks and lines of each pass."""
+
+
 @dataclass(frozen=True, slots=True)
 class PassRequest:
-    """One pass of the stage, from `start_mm` to `end_mm`, lines `line_spacing_mm` apart."""
+    """One pass of the stage, from `start_mm` to `end_mm`, lines `line_spacing_mm` apart.
+
+    `rearm`: after an interruption that was longer than the device's dead-man the laser is switched on again and the
+    pass goes on by itself; otherwise it is held until somebody says so.
+    """
 
     line_spacing_mm: float
     start_mm: float
     end_mm: float
     line_rate_hz: float
+    rearm: bool = False
 
 
 class DeviceSource:
@@ -91,6 +125,8 @@ class DeviceSource:
         self._rig = rig
         self._request = request
         self._position_mm = request.start_mm
+        self._next_mm = request.start_mm  # where a pass that is held would go on
+        self._pausing = threading.Event()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -98,7 +134,7 @@ class DeviceSource:
         """Start the pass on the device and pump its events to the sink."""
         request = self._request
         self._scanner.start_pass(
-            request.line_spacing_mm, request.start_mm, request.end_mm, request.line_rate_hz, resume=True
+            request.line_spacing_mm, request.start_mm, request.end_mm, request.line_rate_hz, resume=request.rearm
         )
         self._thread = threading.Thread(target=self._pump, args=(sink,), name="device-source", daemon=True)
         self._thread.start()
@@ -116,9 +152,31 @@ class DeviceSource:
         if self._thread is not threading.current_thread():
             self._thread.join()
 
+    def pause(self) -> None:
+        """Stop stage and laser; what was measured until then is delivered."""
+        self._pausing.set()
+        try:
+            self._scanner.stop_pass()
+        except DriverError:
+            self._pausing.clear()
+            raise
+
+    def resume(self) -> None:
+        """Switch the laser on and start the rest of the pass behind the last line, as a new pass of the device."""
+        request = self._request
+        self._pausing.clear()
+        self._scanner.start_pass(
+            request.line_spacing_mm, self._next_mm, request.end_mm, request.line_rate_hz, resume=request.rearm
+        )
+
     def tally(self) -> dict[str, Any] | None:
         """Chunks and lines: sent, stored, lost by reason."""
         return self._scanner.tally().to_dict()
+
+    def pass_tallies(self) -> Mapping[PassKey, PassTally]:
+        """See `OnAWire`."""
+        device_id = self.info.device_id
+        return {(device_id, boot, index): told for (boot, index), told in self._scanner.tally().passes.items()}
 
     def progress(self) -> float | None:
         """Share of the travel that the stage has covered."""
@@ -149,26 +207,56 @@ class DeviceSource:
         """Tell the sink of one event; True when the pass is over."""
         match event:
             case Profile():
-                self._position_mm = event.position_mm
+                self._passed(event.position_mm)
                 sink.line(self._rig.place(event))
-            case Disconnected(reason=reason):
-                sink.note("interrupted", {"reason": reason})
-            case OtherDevice(expected_id=expected, found_id=found):
-                sink.note("interrupted", {"reason": f"on its port scanner {found} answers instead of {expected}"})
-            case Reconnected(gap_s=gap_s, streaming=streaming):
-                sink.note("reconnected", {"gap_s": gap_s, "streaming": streaming})
-                if streaming:
-                    sink.note("resumed", {})
-            case PassResumed(pass_index=pass_index, from_mm=from_mm):
-                sink.note("resumed", {"pass_index": pass_index, "from_mm": from_mm})
-            case PassNotResumed(reason=reason):
-                sink.note("not_resumed", {"reason": reason})
-            case Rebooted(old_boot_id=old, new_boot_id=new):
-                sink.note("rebooted", {"old_boot_id": old, "new_boot_id": new})
             case PassEnded(pass_index=pass_index, reason=reason):
                 sink.note("pass_ended", {"pass_index": pass_index, "reason": reason})
+                if reason == "stopped" and self._pausing.is_set() and not self._stopping.is_set():
+                    return self._is_complete()
+                if reason in ("dead_man", "rebooted") and not self._request.rearm:
+                    if self._is_complete():
+                        return True
+                    sink.note("held", {"reason": reason, "from_mm": self._next_mm})
+                    return False
                 return reason in ("reached_end", "stopped", "fault")
+            case _:
+                tell_scanner_event(event, sink)
         return False
+
+    def _passed(self, position_mm: float) -> None:
+        """A line was read at a stage position."""
+        request = self._request
+        self._position_mm = position_mm
+        if math.isfinite(position_mm):
+            self._next_mm = position_mm + math.copysign(request.line_spacing_mm, request.end_mm - request.start_mm)
+
+    def _is_complete(self) -> bool:
+        """True when the last line of the pass has been read: there is no rest to go on with."""
+        request = self._request
+        return (request.end_mm - self._next_mm) * (request.end_mm - request.start_mm) < 0
+
+
+def tell_scanner_event(event: ScannerEvent, sink: Sink) -> None:
+    """Tell the sink what happened to a scanner, but for the end of its pass."""
+    match event:
+        case Disconnected(reason=reason):
+            sink.note("interrupted", {"reason": reason})
+        case OtherDevice(expected_id=expected, found_id=found):
+            sink.note("interrupted", {"reason": f"on its port scanner {found} answers instead of {expected}"})
+        case Reconnected(gap_s=gap_s, streaming=streaming):
+            sink.note("reconnected", {"gap_s": gap_s, "streaming": streaming})
+            if streaming:
+                sink.note("resumed", {})
+        case PassResumed(pass_index=pass_index, from_mm=from_mm):
+            sink.note("resumed", {"pass_index": pass_index, "from_mm": from_mm})
+        case PassNotResumed(reason=reason):
+            sink.note("not_resumed", {"reason": reason})
+        case Rebooted(old_boot_id=old, new_boot_id=new):
+            sink.note("rebooted", {"old_boot_id": old, "new_boot_id": new})
+        case ClockJumped(count=count):
+            sink.note("clock_jumped", {"count": count})
+        case Advice(text=text):
+            sink.note("advice", {"text": text})
 
 
 class ReplaySource:
@@ -196,6 +284,9 @@ class ReplaySource:
         self._speed = speed
         self._clock = clock
         self._played = 0
+        self._going = threading.Event()
+        self._going.set()
+        self._held_s = 0.0
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -207,8 +298,17 @@ class ReplaySource:
     def stop(self) -> None:
         """Stop playing."""
         self._stopping.set()
+        self._going.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
+
+    def pause(self) -> None:
+        """Hold the replay."""
+        self._going.clear()
+
+    def resume(self) -> None:
+        """Play on."""
+        self._going.set()
 
     def tally(self) -> dict[str, Any] | None:
         """What the file held, and what of it could not be used."""
@@ -225,8 +325,9 @@ class ReplaySource:
         try:
             for line in self._lines:
                 first_s = line.device_time_s if first_s is None else first_s
+                self._wait_while_held()
                 if self._speed is not None:
-                    due_s = (line.device_time_s - first_s) / self._speed
+                    due_s = (line.device_time_s - first_s) / self._speed + self._held_s
                     self._stopping.wait(max(0.0, due_s - (self._clock() - begun_s)))
                 if self._stopping.is_set():
                     break
@@ -241,12 +342,31 @@ class ReplaySource:
             failure = f"the replay stopped by an internal fault: {error}"
         sink.ended(failure)
 
+    def _wait_while_held(self) -> None:
+        if not self._going.is_set():
+            held_s = self._clock()
+            self._going.wait()
+            self._held_s += self._clock() - held_s
+
 
 class SpentSource:
-    """The source of a session that was reopened from the record: what it had is stored, nothing more comes."""
+    """The source of a session that was reopened from the record: what it had is stored, nothing more comes.
 
-    geometry: SensorGeometry | None = None
-    towards_sensor: Float64Array | None = None
+    `geometry` and `towards_sensor` are those of the source that it had.
+    """
+
+    def __init__(
+        self,
+        geometry: SensorGeometry | None = None,
+        towards_sensor: Float64Array | None = None,
+    ) -> None:
+        self.geometry = geometry
+        self.towards_sensor = towards_sensor
+        self._told: dict[str, Any] | None = None
+
+    def remember(self, told: dict[str, Any] | None) -> None:
+        """Tell from now on what the driver had counted."""
+        self._told = told
 
     def start(self, sink: Sink) -> None:
         """Cannot be started again."""
@@ -256,8 +376,8 @@ class SpentSource:
         """Nothing to let go of."""
 
     def tally(self) -> dict[str, Any] | None:
-        """What the driver counted is in the record's events."""
-        return None
+        """What the driver had counted."""
+        return self._told
 
     def progress(self) -> float | None:
         """Everything that was stored is there."""
@@ -275,6 +395,12 @@ class PushSource:
 
     def stop(self) -> None:
         """Nothing to let go of."""
+
+    def pause(self) -> None:
+        """Nothing to hold: the session refuses lines."""
+
+    def resume(self) -> None:
+        """Nothing to go on with."""
 
     def tally(self) -> dict[str, Any] | None:
         """There is no wire."""

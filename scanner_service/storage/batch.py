@@ -9,16 +9,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, delete, func, insert, select, update
+from sqlalchemy import Connection, Table, delete, func, insert, select, update
 
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.storage.encoding import encode_line
-from scanner_service.storage.errors import SessionDamaged, SessionUnknown
-from scanner_service.storage.rows import EventRow, SessionRow, Stored
+from scanner_service.storage.errors import CreationKeyReused, SessionDamaged, SessionUnknown
+from scanner_service.storage.rows import CreationKey, EventRow, SessionRow, Stored
 from scanner_service.storage.tables import (
+    creations,
     events,
     from_json,
+    ledgers,
     lines,
+    notes,
     plain_text,
     record,
     row_crc,
@@ -105,8 +108,12 @@ class Batch:
         newest: str | None = self._connection.execute(select(func.max(sessions.c.session_id))).scalar()
         return newest
 
-    def create_session(self, session: SessionRow) -> SessionRow:
-        """Store a session."""
+    def made_with(self, key: CreationKey) -> SessionRow | None:
+        """The session that an earlier request with this key made; raises CreationKeyReused for another request."""
+        return session_made_with(self._connection, key)
+
+    def create_session(self, session: SessionRow, key: CreationKey | None = None) -> SessionRow:
+        """Store a session, and with which request it was made."""
         x_mm, y_mm, z_mm = session.origin_mm
         row = {
             "session_id": session.session_id,
@@ -122,14 +129,42 @@ class Batch:
             "deleted_utc": "",
         }
         self._connection.execute(insert(sessions).values(row | {"crc32": row_crc(row)}))
+        if session.calibration or session.notes:
+            self._put(notes, session.session_id, _notes_row(session.session_id, session.notes, session.calibration))
+        if key is not None:
+            made = {
+                "key_sha256": key.key_sha256,
+                "request_sha256": key.request_sha256,
+                "session_id": session.session_id,
+                "time_utc": session.created_utc,
+            }
+            of_deleted = creations.c.key_sha256 == key.key_sha256  # of no other: `made_with` was asked
+            self._connection.execute(delete(creations).where(of_deleted))
+            self._connection.execute(insert(creations).values(made | {"crc32": row_crc(made)}))
         self.tails[session.session_id] = Tail()
         return session
 
+    def describe(self, session_id: str, name: str | None, text: str | None, now_utc: str) -> SessionRow:
+        """Change a session's name or notes."""
+        changes = {"changed_utc": now_utc} | ({} if name is None else {"name": name})
+        row = self._update(session_id, self._sound_session(session_id), changes)
+        kept = self._connection.execute(select(notes).where(notes.c.session_id == session_id)).first()
+        before = kept._asdict() if kept is not None else _notes_row(session_id, "", {})
+        if text is not None:
+            calibration = from_json(before["calibration"]) or {}
+            before = _notes_row(session_id, text, calibration)
+            self._put(notes, session_id, before)
+        return session_from(row | _renamed(before))
+
+    def save_ledger(self, session_id: str, account: Mapping[str, Any], now_utc: str) -> None:
+        """Keep the account of a session's losses, in place of the one before."""
+        self._tail(session_id)
+        row = {"session_id": session_id, "time_utc": now_utc, "account": to_json(account, "ledger")}
+        self._put(ledgers, session_id, row | {"crc32": row_crc(row)})
+
     def set_state(self, session_id: str, state: str, now_utc: str) -> SessionRow:
         """Change a session's state."""
-        row = self._session(session_id)
-        if row.pop("crc32") != row_crc(row):
-            raise SessionDamaged(f"session {session_id} fails its checksum and is not changed; its lines are readable")
+        row = self._sound_session(session_id)
         return session_from(self._update(session_id, row, {"state": state, "changed_utc": now_utc}))
 
     def delete_session(self, session_id: str, now_utc: str) -> None:
@@ -146,7 +181,8 @@ class Batch:
             in_slice = lines.c.line_number < first + DELETE_SLICE_LINES
             self._connection.execute(delete(lines).where(of_session, in_slice))
             return False
-        self._connection.execute(delete(events).where(events.c.session_id == session_id))
+        for table in (events, notes, ledgers, creations):
+            self._connection.execute(delete(table).where(table.c.session_id == session_id))
         self._connection.execute(delete(sessions).where(sessions.c.session_id == session_id))
         return True
 
@@ -192,6 +228,18 @@ class Batch:
             raise SessionUnknown(f"there is no session {session_id}")
         return row._asdict()
 
+    def _sound_session(self, session_id: str) -> dict[str, Any]:
+        row = self._session(session_id)
+        if row.pop("crc32") != row_crc(row):
+            raise SessionDamaged(f"session {session_id} fails its checksum and is not changed; its lines are readable")
+        return row
+
+    def _put(self, table: Table, session_id: str, row: Mapping[str, Any]) -> None:
+        """Write the one row that a session has in a table."""
+        changed = self._connection.execute(update(table).where(table.c.session_id == session_id).values(row))
+        if changed.rowcount == 0:
+            self._connection.execute(insert(table).values(row))
+
     def _update(self, session_id: str, row: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
         """Write the changes alone: the other values may be damaged, and the database would not take them back."""
         changes = changes | {"crc32": row_crc(row | changes)}
@@ -199,20 +247,62 @@ class Batch:
         return row | changes
 
 
+SESSION_COLUMNS = (*sessions.c, notes.c.notes, notes.c.calibration, notes.c.crc32.label("notes_crc32"))
+"""Everything that a session is, its row joined with its notes."""
+
+
 def session_from(row: Mapping[str, Any]) -> SessionRow:
-    """A row of the table as a value; what cannot be read of a damaged row is left empty."""
-    settings, source = from_json(row["settings"]), from_json(row["source"])
+    """A row of the table, with its notes when they were read too; what cannot be read of a damaged row is empty."""
+    own = {column.name: row[column.name] for column in sessions.c}
+    settings, source = from_json(own["settings"]), from_json(own["source"])
+    text, calibration, sound = "", {}, True
+    if row.get("notes_crc32") is not None:
+        told = {"session_id": own["session_id"], "notes": row["notes"], "calibration": row["calibration"]}
+        text, calibration = _legible(row["notes"]), from_json(row["calibration"]) or {}
+        sound = row["notes_crc32"] == row_crc(told)
     return SessionRow(
-        session_id=_legible(row["session_id"]),
-        name=_legible(row["name"]),
-        created_utc=_legible(row["created_utc"]),
-        changed_utc=_legible(row["changed_utc"]),
-        state=_legible(row["state"]),
+        session_id=_legible(own["session_id"]),
+        name=_legible(own["name"]),
+        created_utc=_legible(own["created_utc"]),
+        changed_utc=_legible(own["changed_utc"]),
+        state=_legible(own["state"]),
         settings=settings or {},
-        origin_mm=(row["origin_x_mm"], row["origin_y_mm"], row["origin_z_mm"]),
+        origin_mm=(own["origin_x_mm"], own["origin_y_mm"], own["origin_z_mm"]),
         source=source or {},
-        damaged=row["crc32"] != row_crc(row) or settings is None or source is None,
+        damaged=own["crc32"] != row_crc(own) or settings is None or source is None or not sound,
+        notes=text,
+        calibration=calibration,
     )
+
+
+def session_made_with(connection: Connection, key: CreationKey) -> SessionRow | None:
+    """The session that a request with this key made; None when there is none, or it is deleted.
+
+    Raises
+    ------
+    CreationKeyReused : the key came with another request.
+    """
+    query = (
+        select(*SESSION_COLUMNS, creations.c.request_sha256)
+        .join(creations, creations.c.session_id == sessions.c.session_id)
+        .outerjoin(notes, notes.c.session_id == sessions.c.session_id)
+        .where(creations.c.key_sha256 == key.key_sha256)
+    )
+    row = connection.execute(query).mappings().first()
+    if row is None or row["deleted_utc"]:
+        return None
+    if row["request_sha256"] != key.request_sha256:
+        raise CreationKeyReused("this Idempotency-Key came before, with another request; send a new key")
+    return session_from(dict(row))
+
+
+def _notes_row(session_id: str, text: str, calibration: Mapping[str, Any]) -> dict[str, Any]:
+    row = {"session_id": session_id, "notes": text, "calibration": to_json(calibration, "calibration")}
+    return row | {"crc32": row_crc(row)}
+
+
+def _renamed(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {"notes": row["notes"], "calibration": row["calibration"], "notes_crc32": row["crc32"]}
 
 
 def _legible(text: Any) -> str:

@@ -1,20 +1,22 @@
-"""The record's SQLite file: its lock, its making, its checks and its connections; knows no session and no line."""
+"""The record as an SQLite file: its lock, its making, its checks, its connections; knows no session and no line."""
 
 import contextlib
 import fcntl
 import os
 import sqlite3
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from sqlalchemy import Engine, create_engine, event, insert
+from sqlalchemy import Connection, Engine, create_engine, event, insert
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.pool import NullPool, QueuePool
 
 from scanner_service.storage.errors import NotARecord, RecordInUse, RecordNotWritable, RecordTooNew, SqliteTooOld
+from scanner_service.storage.migrations import migrate
+from scanner_service.storage.place import StorageFault
 from scanner_service.storage.tables import APPLICATION_ID, SCHEMA_VERSION, metadata, record
 
 OLDEST_SQLITE = (3, 37, 0)
@@ -116,8 +118,8 @@ def check_place(path: Path) -> None:
         raise RecordNotWritable(f"the record {path} may not be written; check its owner and whether the disk is")
 
 
-def check_identity(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse a database that is not a record, or not one this version knows.
+def check_identity(connection: sqlite3.Connection, path: Path) -> int:
+    """The schema of a record; refuses a database that is none, or not one this version knows.
 
     Raises
     ------
@@ -129,6 +131,7 @@ def check_identity(connection: sqlite3.Connection, path: Path) -> None:
     except sqlite3.DatabaseError as error:
         raise NotARecord(f"{path} cannot be opened as a record: {error}; choose another file") from error
     _check_marks(application, version, path)
+    return int(version)
 
 
 def check_file(path: Path) -> None:
@@ -181,6 +184,101 @@ def create_file(path: Path, created_utc: str) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+class SqliteFile:
+    """A record in a file of its own, opened, locked and of this version's schema."""
+
+    def __init__(self, path: Path, lock: RecordLock, factory: type[sqlite3.Connection]) -> None:
+        self.path = path
+        self.name = str(path)
+        self.library = sqlite_library()
+        self._lock = lock
+        self._factory = factory
+        self._identity = path.stat()
+
+    @classmethod
+    def open(cls, path: Path, created_utc: Callable[[], str], factory: type[sqlite3.Connection]) -> "SqliteFile":
+        """Open the file, make it when it is not there, and bring an older one up to date.
+
+        Raises
+        ------
+        RecordUnusable : nothing was changed.
+        """
+        sqlite_library()
+        path = path.resolve()
+        with contextlib.ExitStack() as undo:
+            with writable(path):
+                check_place(path)
+                lock = RecordLock(path)  # before the file is looked at: see `docs/record.md`
+                undo.callback(lock.release)
+                if not path.exists():
+                    create_file(path, created_utc())
+                check_file(path)
+            opened = cls(path, lock, factory)
+            try:
+                opened._bring_up_to_date()
+            except (DBAPIError, sqlite3.Error) as error:
+                said = error.orig if isinstance(error, DBAPIError) else error
+                raise RecordNotWritable(f"the record {path} cannot be opened: {said}") from error
+            undo.pop_all()
+        return opened
+
+    def writer_engine(self) -> Engine:
+        """See `Place`."""
+        return writer_engine(self.path, self._factory)
+
+    def reader_engine(self) -> Engine:
+        """See `Place`."""
+        return reader_engine(self.path)
+
+    def check(self) -> None:
+        """SQLite goes on writing into a file that was removed; what is written there is lost at closing."""
+        try:
+            same = os.path.samestat(self.path.stat(), self._identity)
+        except OSError:
+            same = False
+        if not same:
+            raise StorageFault(f"the file {self.path.name} of the record was removed or replaced; put it back")
+
+    def copy_log(self, connection: Connection, *, everything: bool, longest_bytes: int) -> str:
+        """Copy the log into the file; when readers hold up its reuse for too long, wait a little for them."""
+        raw = cast("sqlite3.Connection", connection.connection.dbapi_connection)
+        try:
+            frames, _ = checkpoint(raw, "TRUNCATE" if everything else "PASSIVE")
+            if frames * PAGE_BYTES > longest_bytes:
+                checkpoint(raw, "RESTART")
+        except sqlite3.Error as error:  # what is acknowledged is safe in the log, which grows until this succeeds
+            return str(error)
+        return ""
+
+    def release(self) -> None:
+        """Let others have the file."""
+        self._lock.release()
+
+    def _bring_up_to_date(self) -> None:
+        """Migrate an older record, in one transaction."""
+        with contextlib.closing(writer_engine(self.path, sqlite3.Connection).raw_connection()) as raw:
+            if raw.cursor().execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION:
+                return
+        with writer_engine(self.path, sqlite3.Connection).begin() as connection:
+            if migrate(connection):
+                connection.exec_driver_sql(f"PRAGMA user_version={SCHEMA_VERSION}")
+
+
+def structure_problems(connection: Connection) -> Iterator[str]:
+    """What SQLite itself finds wrong with the file; it sees no flipped bit of a value."""
+    for (message,) in connection.exec_driver_sql("PRAGMA integrity_check"):
+        if message != "ok":
+            yield str(message)
+
+
+def used_bytes(connection: Connection) -> int:
+    """Bytes of the file that hold something."""
+    pages, free = (
+        int(connection.exec_driver_sql(f"PRAGMA {name}").scalar_one()) for name in ("page_count", "freelist_count")
+    )
+    return (pages - free) * PAGE_BYTES
 
 
 def writer_engine(path: Path, factory: type[sqlite3.Connection]) -> Engine:

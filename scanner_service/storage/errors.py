@@ -6,13 +6,16 @@ RecordError
 │   ├── RecordTooNew          written by a newer version of the service
 │   ├── RecordInUse           another service holds it
 │   ├── RecordNotWritable     no such folder, a folder itself, read-only, not permitted
-│   └── SqliteTooOld
+│   ├── SqliteTooOld
+│   └── RecordNotDurable      the database server may forget what it has confirmed, or cannot be reached
 ├── RecordBusy                the spool is full: the line was not taken
 ├── RecordClosed              nothing is taken after close; what waited is not confirmed
 ├── SessionUnknown            no such session, or it is deleted
 ├── SessionDamaged            the session's row fails its checksum and may not be changed
+├── CreationKeyReused         the key of a request to create came before with another request
 ├── NotStorable               the value does not fit the record
 ├── WriteRefused              the database refused this one value; the others went on
+├── RecordUnreadable          the database could not answer
 └── LineDamaged               stored bytes that fail their checksum, or are gone
 """
 
@@ -45,6 +48,10 @@ class SqliteTooOld(RecordUnusable):
     """The SQLite library of this Python is older than the record needs."""
 
 
+class RecordNotDurable(RecordUnusable):
+    """The database server is set up so that it may forget what it has confirmed, or cannot be reached at all."""
+
+
 class RecordBusy(RecordError):
     """The spool is full; what was offered was not taken and must be counted or offered again by the caller."""
 
@@ -59,6 +66,10 @@ class SessionUnknown(RecordError):
 
 class SessionDamaged(RecordError):
     """The session's own row fails its checksum."""
+
+
+class CreationKeyReused(RecordError):
+    """The key of a request to create came before, with another request."""
 
 
 class NotStorable(RecordError, ValueError):

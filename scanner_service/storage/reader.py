@@ -4,21 +4,41 @@ No read holds a transaction for longer than one chunk, so a slow reader never ke
 """
 
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Select, func, select
+from sqlalchemy import Connection, Engine, Select, Table, func, select, text
 from sqlalchemy.exc import DBAPIError
 
 from scanner_service.analysis.intake import StoredLine
-from scanner_service.storage.batch import session_from
-from scanner_service.storage.database import check_identity, reader_engine
+from scanner_service.analysis.passes import PassKey
+from scanner_service.storage.batch import SESSION_COLUMNS, session_from, session_made_with
+from scanner_service.storage.database import check_identity, reader_engine, structure_problems, used_bytes
 from scanner_service.storage.encoding import decode_line
 from scanner_service.storage.errors import LineDamaged, NotARecord, RecordUnreadable, SessionUnknown
-from scanner_service.storage.rows import Count, DamagedLine, EventRow, SessionRow, Verification, Watermark
-from scanner_service.storage.tables import events, from_json, lines, row_crc, sessions
+from scanner_service.storage.postgres import PostgresSchema, is_url
+from scanner_service.storage.rows import (
+    Count,
+    CreationKey,
+    DamagedLine,
+    EventRow,
+    SessionRow,
+    Verification,
+    Watermark,
+)
+from scanner_service.storage.tables import (
+    SCHEMA_VERSION,
+    events,
+    from_json,
+    ledgers,
+    lines,
+    metadata,
+    notes,
+    row_crc,
+    sessions,
+)
 from scanner_service.storage.tail import load_count, load_tail
 
 _LINES_A_CHUNK = 32
@@ -29,26 +49,31 @@ OnDamage = Callable[[DamagedLine], None]
 class RecordReader:
     """The reading half of a record, for any thread and, by itself, for another process."""
 
-    def __init__(self, path: Path) -> None:
-        self._engine = reader_engine(path)
+    def __init__(self, engine: Engine, schema: int = SCHEMA_VERSION) -> None:
+        self._engine = engine
+        self._schema = schema
 
     @classmethod
-    def open(cls, path: Path) -> "RecordReader":
-        """A reader of a record that may at the same time be open in a service.
+    def open(cls, where: Path | str) -> "RecordReader":
+        """A reader of a record that may at the same time be open in a service, in a file or at `postgresql://…`.
+
+        A record of an older schema is read as it is.
 
         Raises
         ------
         NotARecord, RecordTooNew
         """
-        path = path.resolve()
+        if is_url(where):
+            return cls(PostgresSchema.of_reader(str(where)).reader_engine())
+        path = Path(where).resolve()
         if not path.is_file():
             raise NotARecord(f"there is no record {path}")
         try:
             with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
-                check_identity(connection, path)
+                schema = check_identity(connection, path)
         except sqlite3.Error as error:
             raise NotARecord(f"the record {path} cannot be read: {error}") from error
-        return cls(path)
+        return cls(reader_engine(path), schema)
 
     def close(self) -> None:
         """Let go of the file."""
@@ -56,17 +81,49 @@ class RecordReader:
 
     def list_sessions(self, limit: int = 100, after: str | None = None) -> list[SessionRow]:
         """At most `limit` sessions, the newest first, those older than the session `after`."""
-        query = select(sessions).where(sessions.c.deleted_utc == "").order_by(sessions.c.session_id.desc())
+        query = self._sessions().where(sessions.c.deleted_utc == "").order_by(sessions.c.session_id.desc())
         if after is not None:
             query = query.where(sessions.c.session_id < after)
         return [session_from(row) for row in self._rows(query.limit(limit))]
 
     def get_session(self, session_id: str) -> SessionRow:
         """One session; raises SessionUnknown."""
-        query = select(sessions).where(sessions.c.session_id == session_id, sessions.c.deleted_utc == "")
+        query = self._sessions().where(sessions.c.session_id == session_id, sessions.c.deleted_utc == "")
         for row in self._rows(query):
             return session_from(row)
         raise SessionUnknown(f"there is no session {session_id}")
+
+    def ledger(self, session_id: str) -> Mapping[str, Any] | None:
+        """The account of a session's losses as it was last kept; None when there is none, or it is damaged."""
+        if self._schema < 2:
+            return None
+        for row in self._rows(select(ledgers).where(ledgers.c.session_id == session_id)):
+            return from_json(row["account"]) if row["crc32"] == row_crc(row) else None
+        return None
+
+    def lines_of_passes(self, session_id: str) -> dict[PassKey, int]:
+        """How many lines are stored of each pass of a session, in order of their first."""
+        key = (lines.c.device_id, lines.c.boot_id, lines.c.pass_index)
+        query = select(*key, func.count().label("lines")).where(lines.c.session_id == session_id).group_by(*key)
+        rows = self._rows(query.order_by(func.min(lines.c.line_number)))
+        return {(row["device_id"], row["boot_id"], row["pass_index"]): row["lines"] for row in rows}
+
+    def made_with(self, key: CreationKey) -> SessionRow | None:
+        """The session that a request with this key made, None when there is none; raises CreationKeyReused."""
+        with self._connection() as connection:
+            return session_made_with(connection, key)
+
+    def used_bytes(self) -> int:
+        """Bytes that the record takes."""
+        with self._connection() as connection:
+            if connection.dialect.name == "sqlite":
+                return used_bytes(connection)
+            return int(connection.execute(text("SELECT pg_database_size(current_database())")).scalar_one())
+
+    def session_bytes(self, session_id: str) -> int:
+        """Bytes of the lines of a session."""
+        total = select(func.coalesce(func.sum(func.length(lines.c.encoded)), 0).label("bytes"))
+        return int(self._rows(total.where(lines.c.session_id == session_id))[0]["bytes"])
 
     def events(self, session_id: str, after: int = -1) -> Iterator[EventRow]:
         """The events of a session numbered above `after`, in order; raises SessionUnknown."""
@@ -100,6 +157,16 @@ class RecordReader:
         end = self.count(session_id).lines
         return self._lines(session_id, max(start, 0), end if stop is None else min(stop, end), on_damage)
 
+    def stored_rows(self, session_id: str) -> Iterator[tuple[Table, list[dict[str, Any]]]]:
+        """Every row of a session as it is stored, damaged or not: table by table, lines in chunks; for copies.
+
+        Raises
+        ------
+        SessionUnknown : at once.
+        """
+        self.get_session(session_id)
+        return self._stored_rows(session_id)
+
     def verify(self, session_id: str) -> Verification:
         """Read everything of a session, and the structure of the whole file, and say what is damaged."""
         damaged: list[DamagedLine] = []
@@ -124,12 +191,31 @@ class RecordReader:
                 problems.append(f"{rows} {table.name} are in the table, {seen} in its index")
         return Verification(Count(sound_lines, points), tuple(damaged), tuple(problems))
 
+    def _stored_rows(self, session_id: str) -> Iterator[tuple[Table, list[dict[str, Any]]]]:
+        for table in metadata.sorted_tables:
+            if table is lines or "session_id" not in table.c:
+                continue
+            if self._schema < 2 and table not in (sessions, events):
+                continue  # a record of schema 1 has no others
+            if found := self._rows(select(table).where(table.c.session_id == session_id)):
+                yield table, found
+        last = -1
+        query = select(lines).where(lines.c.session_id == session_id).order_by(lines.c.line_number)
+        while chunk := self._rows(query.where(lines.c.line_number > last).limit(_LINES_A_CHUNK)):
+            yield lines, chunk
+            last = chunk[-1]["line_number"]
+
     def _structure(self) -> Iterator[str]:
-        """What SQLite itself finds wrong with the file; it sees no flipped bit of a value."""
+        """What the database itself finds wrong with the file; a server looks after its own."""
         with self._connection() as connection:
-            for (message,) in connection.exec_driver_sql("PRAGMA integrity_check"):
-                if message != "ok":
-                    yield str(message)
+            if connection.dialect.name == "sqlite":
+                yield from structure_problems(connection)
+
+    def _sessions(self) -> Select[Any]:
+        """Sessions with their notes, which a record of schema 1 does not have."""
+        if self._schema < 2:
+            return select(sessions)
+        return select(*SESSION_COLUMNS).outerjoin(notes, notes.c.session_id == sessions.c.session_id)
 
     def _lines(
         self, session_id: str, start: int, stop: int, on_damage: OnDamage | None

@@ -4,7 +4,6 @@ One writer thread with the only connection that writes (`writer.py`), any number
 is promised, and how it is kept, is in `docs/record.md`.
 """
 
-import contextlib
 import math
 import random
 import sqlite3
@@ -19,22 +18,17 @@ from typing import Any, TypeVar
 from sqlalchemy.exc import DBAPIError
 
 from scanner_service.analysis.intake import StoredLine
+from scanner_service.analysis.passes import PassKey
 from scanner_service.storage.batch import Batch, EncodedLine
-from scanner_service.storage.database import (
-    RecordLock,
-    SqliteLibrary,
-    check_file,
-    check_place,
-    create_file,
-    sqlite_library,
-    writable,
-    writer_engine,
-)
-from scanner_service.storage.errors import NotStorable, RecordNotWritable
+from scanner_service.storage.database import SqliteFile
+from scanner_service.storage.errors import NotStorable, RecordNotDurable, RecordNotWritable
 from scanner_service.storage.identifiers import new_session_id
+from scanner_service.storage.place import Place
+from scanner_service.storage.postgres import PostgresSchema, is_url
 from scanner_service.storage.reader import OnDamage, RecordReader
 from scanner_service.storage.rows import (
     Count,
+    CreationKey,
     EventRow,
     Limits,
     SessionRow,
@@ -61,61 +55,62 @@ class Record:
 
     def __init__(
         self,
-        lock: RecordLock,
+        place: Place,
         writer: Writer,
         reader: RecordReader,
-        sqlite: SqliteLibrary,
         clock: Callable[[], datetime],
         rng: random.Random,
     ) -> None:
-        self._lock = lock
+        self.place = place
         self._writer = writer
         self._reader = reader
         self._clock = clock
         self._rng = rng
         self._let_go = False
-        self.sqlite = sqlite
 
     @classmethod
     def open(
         cls,
-        path: Path,
+        where: Path | str,
         *,
         limits: Limits | None = None,
         clock: Callable[[], datetime] = utc_now,
         rng: random.Random | None = None,
         connection_class: type[sqlite3.Connection] = sqlite3.Connection,
     ) -> "Record":
-        """Open the record in the file `path`, or make an empty one.
+        """Open the record in a file, or at an address `postgresql://…`; make an empty one where there is none.
 
         Parameters
         ----------
-        path : the file; beside it SQLite keeps `-wal` and `-shm`, the service `.lock`.
+        where : the file, beside which SQLite keeps `-wal` and `-shm`, and the service `.lock`; or the address of a
+            PostgreSQL database.
         limits : bounds of the writer.
         clock, rng : time and chance, for time stamps and session ids.
-        connection_class : class of the writer's connection; the seam at which tests let the disk fail.
+        connection_class : class of the writer's connection to a file; the seam at which tests let the disk fail.
 
         Raises
         ------
-        RecordUnusable : one of `NotARecord`, `RecordTooNew`, `RecordInUse`, `RecordNotWritable`, `SqliteTooOld`;
-            nothing was changed.
+        RecordUnusable : one of its kinds; nothing was changed.
         """
-        sqlite = sqlite_library()
-        path = path.resolve()
-        with contextlib.ExitStack() as undo:
-            with writable(path):
-                check_place(path)
-                lock = RecordLock(path)  # before the file is looked at: see `docs/record.md`
-                undo.callback(lock.release)
-                if not path.exists():
-                    create_file(path, _iso(clock()))
-                check_file(path)
-            try:
-                writer = Writer(path, writer_engine(path, connection_class), limits or Limits())
-            except DBAPIError as error:
-                raise RecordNotWritable(f"the record {path} cannot be opened: {error.orig}") from error
-            undo.pop_all()
-        return cls(lock, writer, RecordReader(path), sqlite, clock, rng or random.SystemRandom())
+
+        def now() -> str:
+            return _iso(clock())
+
+        place: Place = (
+            PostgresSchema.open(str(where), now)
+            if is_url(where)
+            else SqliteFile.open(Path(where), now, connection_class)
+        )
+        try:
+            writer = Writer(place, limits or Limits())
+        except DBAPIError as error:
+            place.release()
+            unusable = RecordNotDurable if is_url(where) else RecordNotWritable
+            raise unusable(f"the record {place.name} cannot be opened: {error.orig}") from error
+        except BaseException:
+            place.release()
+            raise
+        return cls(place, writer, RecordReader(place.reader_engine()), clock, rng or random.SystemRandom())
 
     def close(self, timeout_s: float = 10.0) -> int:
         """Take nothing more, write what waits, and let go of the file; idempotent.
@@ -126,7 +121,7 @@ class Record:
         if not self._writer.is_alive and not self._let_go:
             self._let_go = True
             self._reader.close()
-            self._lock.release()
+            self.place.release()
         return given_up
 
     def __enter__(self) -> "Record":
@@ -201,12 +196,15 @@ class Record:
         settings: Mapping[str, Any] | None = None,
         origin_mm: Sequence[float] = (0.0, 0.0, 0.0),
         source: Mapping[str, Any] | None = None,
+        calibration: Mapping[str, Any] | None = None,
+        key: CreationKey | None = None,
     ) -> SessionRow:
-        """Make a session; returns when it is durable.
+        """Make a session; returns when it is durable. With a `key` that came before it is the session made then.
 
         Raises
         ------
         NotStorable, RecordBusy, RecordClosed
+        CreationKeyReused : the key came before, with another request.
         TimeoutError : the disk does not answer; the session may appear later.
         """
         origin = [float(value) for value in origin_mm]
@@ -222,14 +220,18 @@ class Record:
             settings=dict(settings or {}),
             origin_mm=(origin[0], origin[1], origin[2]),
             source=dict(source or {}),
+            calibration=dict(calibration or {}),
         )
-        to_json(session.settings, "settings")
-        to_json(session.source, "source")
+        for what in ("settings", "source", "calibration"):
+            to_json(getattr(session, what), what)
         milliseconds = int(now.timestamp() * 1000)
 
         def create(batch: Batch) -> SessionRow:
+            made = batch.made_with(key) if key is not None else None
+            if made is not None:
+                return made
             session_id = new_session_id(milliseconds, self._rng, batch.newest_session_id())
-            return batch.create_session(replace(session, session_id=session_id))
+            return batch.create_session(replace(session, session_id=session_id), key)
 
         return self._wait_for(create)
 
@@ -243,9 +245,47 @@ class Record:
 
     def set_state(self, session_id: str, state: str) -> SessionRow:
         """Change a session's state; raises SessionUnknown, SessionDamaged and what `create_session` does."""
+        return self.change_state(session_id, state, _PATIENCE_S).result(_PATIENCE_S)
+
+    def change_state(self, session_id: str, state: str, timeout_s: float = 0.0) -> "Future[SessionRow]":
+        """Queue a change of a session's state; the future has its answer when the change is durable."""
         plain_text(state, "state")
         now = self._now()
-        return self._wait_for(lambda batch: batch.set_state(session_id, state, now))
+        return self._writer.submit(lambda batch: batch.set_state(session_id, state, now), _ROW_BYTES, timeout_s)
+
+    def describe(self, session_id: str, *, name: str | None = None, notes: str | None = None) -> SessionRow:
+        """Change the name or the notes of a session, None leaves them; raises what `set_state` does, NotStorable."""
+        for text in (name, notes):
+            if text is not None:
+                plain_text(text, "name and the notes")
+        now = self._now()
+        return self._wait_for(lambda batch: batch.describe(session_id, name, notes, now))
+
+    def save_ledger(self, session_id: str, account: Mapping[str, Any]) -> "Future[None]":
+        """Queue the account of a session's losses, in place of the one before; answered and refused as an event is."""
+        account = dict(account)
+        size_bytes, now = len(to_json(account, "ledger")) + _ROW_BYTES, self._now()
+        return self._writer.submit(lambda batch: batch.save_ledger(session_id, account, now), size_bytes, 0.0)
+
+    def ledger(self, session_id: str) -> Mapping[str, Any] | None:
+        """See `RecordReader.ledger`."""
+        return self._reader.ledger(session_id)
+
+    def lines_of_passes(self, session_id: str) -> Mapping[PassKey, int]:
+        """See `RecordReader.lines_of_passes`."""
+        return self._reader.lines_of_passes(session_id)
+
+    def made_with(self, key: CreationKey) -> SessionRow | None:
+        """See `RecordReader.made_with`."""
+        return self._reader.made_with(key)
+
+    def used_bytes(self) -> int:
+        """See `RecordReader.used_bytes`."""
+        return self._reader.used_bytes()
+
+    def session_bytes(self, session_id: str) -> int:
+        """See `RecordReader.session_bytes`."""
+        return self._reader.session_bytes(session_id)
 
     def delete_session(self, session_id: str) -> None:
         """Delete a session with all it holds; raises SessionUnknown and what `create_session` does.

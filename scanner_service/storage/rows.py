@@ -1,7 +1,7 @@
 """What the record gives and takes, as frozen values; knows no SQL, no file and no thread."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 Outcome = Literal["stored", "duplicate", "conflict"]
@@ -9,7 +9,10 @@ Outcome = Literal["stored", "duplicate", "conflict"]
 
 @dataclass(frozen=True, slots=True)
 class SessionRow:
-    """One session. Times are ISO 8601 in UTC. `damaged`: the row fails its checksum, its values are doubtful."""
+    """One session. Times are ISO 8601 in UTC. `damaged`: a row of it fails its checksum, its values are doubtful.
+
+    `notes` is what a person says of it, `calibration` what the scanner was that took it; both may be empty.
+    """
 
     session_id: str
     name: str
@@ -20,6 +23,16 @@ class SessionRow:
     origin_mm: tuple[float, float, float]
     source: Mapping[str, Any]
     damaged: bool = False
+    notes: str = ""
+    calibration: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class CreationKey:
+    """What makes a request to create safe to repeat: hashes of the key that came with it, and of what it asked."""
+
+    key_sha256: str
+    request_sha256: str
 
 
 @dataclass(frozen=True, slots=True)

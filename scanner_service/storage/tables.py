@@ -26,9 +26,10 @@ from sqlalchemy import (
 from scanner_service.storage.errors import NotStorable
 
 APPLICATION_ID = 0x4C51_4C53  # "LQLS": tells a record from any other SQLite file
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 metadata = MetaData()
+_Key = Text().with_variant(Text(collation="C"), "postgresql")  # sorts byte by byte everywhere
 
 # One row: the schema's version, and the number of the last batch. A batch writes its own number, so that after an
 # error from COMMIT one look tells whether the batch is in.
@@ -44,7 +45,7 @@ record = Table(
 sessions = Table(
     "sessions",
     metadata,
-    Column("session_id", Text, primary_key=True),
+    Column("session_id", _Key, primary_key=True),
     Column("name", Text, nullable=False),
     Column("created_utc", Text, nullable=False),
     Column("changed_utc", Text, nullable=False),
@@ -62,7 +63,7 @@ sessions = Table(
 lines = Table(
     "lines",
     metadata,
-    Column("session_id", Text, ForeignKey("sessions.session_id"), nullable=False),
+    Column("session_id", _Key, ForeignKey("sessions.session_id"), nullable=False),
     Column("line_number", BigInteger, nullable=False),
     Column("device_id", Text, nullable=False),
     Column("boot_id", BigInteger, nullable=False),
@@ -79,7 +80,7 @@ lines = Table(
 events = Table(
     "events",
     metadata,
-    Column("session_id", Text, ForeignKey("sessions.session_id"), nullable=False),
+    Column("session_id", _Key, ForeignKey("sessions.session_id"), nullable=False),
     Column("number", BigInteger, nullable=False),
     Column("time_utc", Text, nullable=False),
     Column("kind", Text, nullable=False),
@@ -87,6 +88,35 @@ events = Table(
     Column("details", Text, nullable=False),
     Column("crc32", BigInteger, nullable=False),
     UniqueConstraint("session_id", "number"),
+)
+
+# Schema 2: what a person says of a session and what the scanner was; the account of its losses; which request made it.
+notes = Table(
+    "notes",
+    metadata,
+    Column("session_id", _Key, ForeignKey("sessions.session_id"), primary_key=True),
+    Column("notes", Text, nullable=False),
+    Column("calibration", Text, nullable=False),
+    Column("crc32", BigInteger, nullable=False),
+)
+
+ledgers = Table(
+    "ledgers",
+    metadata,
+    Column("session_id", _Key, ForeignKey("sessions.session_id"), primary_key=True),
+    Column("time_utc", Text, nullable=False),
+    Column("account", Text, nullable=False),
+    Column("crc32", BigInteger, nullable=False),
+)
+
+creations = Table(
+    "creations",
+    metadata,
+    Column("key_sha256", Text, primary_key=True),
+    Column("request_sha256", Text, nullable=False),
+    Column("session_id", _Key, ForeignKey("sessions.session_id"), nullable=False, index=True),
+    Column("time_utc", Text, nullable=False),
+    Column("crc32", BigInteger, nullable=False),
 )
 
 Index("sessions_not_deleted", sessions.c.deleted_utc, sessions.c.session_id)

@@ -6,18 +6,15 @@ record is asked for the number of its last batch: if it is this one, it is in, a
 
 import contextlib
 import logging
-import os
-import sqlite3
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar
 
-from sqlalchemy import Connection, Engine, select
+from sqlalchemy import Connection, select
 from sqlalchemy.exc import (
     DataError,
     DBAPIError,
@@ -28,8 +25,8 @@ from sqlalchemy.exc import (
 )
 
 from scanner_service.storage.batch import Batch, batch_number, set_batch_number
-from scanner_service.storage.database import PAGE_BYTES, checkpoint
 from scanner_service.storage.errors import RecordBusy, RecordClosed, RecordError, RecordUnusable, WriteRefused
+from scanner_service.storage.place import Place, StorageFault
 from scanner_service.storage.rows import Limits, Stored, Watermark, WriterState
 from scanner_service.storage.tables import sessions
 from scanner_service.storage.tail import Tail
@@ -51,19 +48,14 @@ class Job(Generic[T]):
     answer: "Future[T]"
 
 
-class StorageFault(Exception):
-    """The disk or the database would not do its work; nothing is wrong with what was to be written."""
-
-
 class Writer:
     """Owns the connection that writes; jobs are done in the order in which they were submitted."""
 
-    def __init__(self, path: Path, engine: Engine, limits: Limits) -> None:
-        self._path = path
-        self._engine = engine
+    def __init__(self, place: Place, limits: Limits) -> None:
+        self._place = place
+        self._engine = place.writer_engine()
         self._limits = limits
-        self._connection: Connection | None = engine.connect()  # handed to the thread, which alone uses it from here on
-        self._identity = path.stat()
+        self._connection: Connection | None = self._engine.connect()  # the thread's alone from here on
         self._batch_number = batch_number(self._connection)
         gone = select(sessions.c.session_id).where(sessions.c.deleted_utc != "")
         self._deleting = deque(self._connection.execute(gone).scalars())
@@ -164,8 +156,8 @@ class Writer:
                 elif self._give_up_s is not None:
                     break
                 if self._since_checkpoint_bytes >= self._limits.checkpoint_bytes:
-                    self._checkpoint("PASSIVE")
-            self._checkpoint("TRUNCATE")
+                    self._checkpoint()
+            self._checkpoint(everything=True)
         except Exception:  # noqa: BLE001 - the thread's loop: whatever it is, nobody may be left waiting
             _log.exception("the writer of the record stopped")
             with self._change:
@@ -210,16 +202,16 @@ class Writer:
                         batch, answers = self._perform(connection, jobs)
                         set_batch_number(connection, number)
                         done = batch, answers  # from here on the batch may be in, whatever COMMIT says
-                self._check_file()
+                self._place.check()
                 break
-            except _VALUE_FAULTS as error:
-                if len(jobs) > 1:  # one of them is to blame: alone, each gets its own answer
-                    for job in jobs:
-                        self._store([job])
-                else:
-                    self._answer(jobs, [WriteRefused(f"the database refused it: {_reason(error)}")])
-                return
-            except (DBAPIError, StorageFault) as error:
+            except (*_VALUE_FAULTS, DBAPIError, StorageFault) as error:
+                if _blames_a_value(error):
+                    if len(jobs) > 1:  # one of them is to blame: alone, each gets its own answer
+                        for job in jobs:
+                            self._store([job])
+                    else:
+                        self._answer(jobs, [WriteRefused(f"the database refused it: {_reason(error)}")])
+                    return
                 attempts += 1
                 if not self._wait_to_retry(error, delay_s, attempts):
                     reason = f"not confirmed as stored when the record was closed: {_reason(error)}"
@@ -272,8 +264,10 @@ class Writer:
         """Say what is wrong and wait; False when it is time to give up."""
         if attempts == 1:
             _log.error("the record cannot be written, trying again: %s", _reason(error))
-        if self._connection is not None and (attempts % _REOPEN_AFTER == 0 or self._connection.in_transaction()):
-            self._disconnect()  # a disk that went away and came back needs new descriptors
+        if self._connection is not None and (
+            attempts % _REOPEN_AFTER == 0 or self._connection.in_transaction() or self._connection.invalidated
+        ):
+            self._disconnect()  # a disk, or a server, that went away and came back needs a new connection
         with self._change:
             self._state = replace(self._state, state="failing", reason=_reason(error))
             self._counts["retries"] += 1
@@ -289,23 +283,23 @@ class Writer:
         if self._connection is None:
             try:
                 self._connection = self._engine.connect()
+                self._check_nobody_else_wrote(self._connection)
             except RecordUnusable as error:
                 raise StorageFault(str(error)) from error
         with self._connection.begin():
             yield self._connection
 
+    def _check_nobody_else_wrote(self, connection: Connection) -> None:
+        """While we were without a connection, and without its lock, another service may have taken the record over."""
+        with connection.begin():
+            found = batch_number(connection)
+        if found not in (self._batch_number, self._batch_number + 1):
+            self._disconnect()
+            raise StorageFault("another service has written the record meanwhile; stop one of them and start again")
+
     def _is_in(self, number: int) -> bool:
         with self._transaction() as connection:
             return batch_number(connection) == number
-
-    def _check_file(self) -> None:
-        """SQLite goes on writing into a file that was removed; what is written there is lost at closing."""
-        try:
-            same = os.path.samestat(self._path.stat(), self._identity)
-        except OSError:
-            same = False
-        if not same:
-            raise StorageFault(f"the file {self._path.name} of the record was removed or replaced; put it back")
 
     def _delete_slice(self) -> None:
         session_id = self._deleting[0]
@@ -315,26 +309,20 @@ class Writer:
         if job.answer.exception() is None and job.answer.result():
             self._deleting.popleft()
 
-    def _checkpoint(self, mode: str) -> None:
-        """Copy the log into the file; when readers hold up its reuse for too long, wait a little for them."""
+    def _checkpoint(self, everything: bool = False) -> None:
+        """Have the log copied where the database leaves that to us."""
         self._since_checkpoint_bytes = 0
         if self._connection is None:
             return
-        raw = self._connection.connection.dbapi_connection
-        problem = ""
-        try:
-            frames, _ = checkpoint(cast("sqlite3.Connection", raw), mode)
-            if frames * PAGE_BYTES > self._limits.wal_bytes:
-                checkpoint(cast("sqlite3.Connection", raw), "RESTART")
-        except sqlite3.Error as error:  # what is acknowledged is safe in the log, which grows until this succeeds
-            problem = str(error)
+        problem = self._place.copy_log(self._connection, everything=everything, longest_bytes=self._limits.wal_bytes)
+        if problem:
             _log.error("the record's log could not be copied into its file: %s", problem)
         with self._change:
             self._state = replace(self._state, checkpoint_problem=problem)
 
     def _disconnect(self) -> None:
         if self._connection is not None:
-            with contextlib.suppress(DBAPIError, sqlite3.Error):
+            with contextlib.suppress(Exception):  # it is thrown away, whatever it says
                 self._connection.close()
             self._connection = None
 
@@ -352,5 +340,11 @@ class Writer:
                 self._state = replace(self._state, state="closed")
 
 
+def _blames_a_value(error: Exception) -> bool:
+    """True when the database refused what was to be written; a server that went away refuses nothing."""
+    return isinstance(error, _VALUE_FAULTS) and not (isinstance(error, DBAPIError) and error.connection_invalidated)
+
+
 def _reason(error: Exception) -> str:
-    return str(error.orig) if isinstance(error, DBAPIError) else str(error)
+    text = str(error.orig if isinstance(error, DBAPIError) else error).strip()
+    return text.splitlines()[0] if text else type(error).__name__

@@ -164,7 +164,7 @@ def test_a_pulled_cable_pauses_the_scan_and_its_return_resumes_it(running, tmp_p
     service = running.service()
     link = tmp_path / "scanner-port"
     simulator = running.simulator("plate", "--link", link)
-    session_id = service.create(**device(simulator, port=str(link)))
+    session_id = service.create(**device(simulator, port=str(link), rearm=True))
     service.start(session_id)
     wait_for(lambda: service.status(session_id)["lines"] > 10, "some lines")
     simulator.tell("unplug")
@@ -247,7 +247,9 @@ def test_a_session_that_was_never_started_lets_go_of_its_port(running):
     session_id = service.create(**device(simulator))
     service.client.post(f"/api/v1/sessions/{session_id}/stop")
     again = service.create(**device(simulator))
-    service.client.delete(f"/api/v1/sessions/{again}")
+    refused = service.client.delete(f"/api/v1/sessions/{again}")
+    assert (refused.status_code, refused.json()["type"]) == (409, "/problems/not-confirmed")
+    assert service.client.delete(f"/api/v1/sessions/{again}", params={"confirm": again}).status_code == 204
     service.create(**device(simulator))
 
 
@@ -292,7 +294,7 @@ def test_pushed_scanlines_are_answered_when_durable_and_stored_once(running):
     again = service.client.post(url, json={"lines": lines[:3]})
     assert {line["outcome"] for line in again.json()["lines"]} == {"duplicate"}
     status = service.client.post(f"/api/v1/sessions/{session_id}/stop").json()
-    assert (status["state"], status["lines"], status["points"]) == ("stopped", 23, 20 * 34)
+    assert (status["state"], status["lines"], status["points"]) == ("stopped", 20, 20 * 34)
     with live_client(service, session_id) as client:  # more may be pushed later: the stream stays open
         client.listen(until=lambda c: len(c.points) == 20 * 34 and c.regions)
         service.start(session_id)

@@ -9,8 +9,11 @@ import pytest
 import typer.main
 from fastapi import FastAPI
 
+from drivers.rig_file import parse_rig
+from drivers.stages.known import KNOWN as STAGES
+from drivers.stages.known import open_stage
 from scanner_service.api.login import login_router
-from scanner_service.api.routes import health, live, passes, results, scanlines, sessions
+from scanner_service.api.routes import analyses, exports, health, live, passes, results, scanlines, sessions
 from scanner_service.api.scopes import route_table
 from scanner_service.cli import app
 from scanner_service.sessions.settings import SessionSettings
@@ -93,7 +96,7 @@ def test_every_setting_of_a_session_is_documented_with_its_default():
 def test_every_address_is_documented_with_its_role():
     service = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     service.include_router(login_router())
-    for module in (health, sessions, scanlines, results, passes, live):
+    for module in (health, sessions, scanlines, results, passes, exports, live, analyses):
         service.include_router(module.router)
     declared = {
         (method, route.path, route.role.name.lower() if route.role else "public")
@@ -128,3 +131,36 @@ def test_no_file_tells_of_the_place_where_it_was_written():
         if "vendor" not in path.parts:
             found = place.search(text_of(path))
             assert found is None, f"{path.relative_to(ROOT)}: {found[0]}"
+
+
+def test_every_example_of_a_rig_file_is_one_and_its_stage_can_be_opened():
+    examples = [
+        (page.name, block)
+        for page in sorted((DOCS / "devices").glob("*.md"))
+        for block in re.findall(r"^```toml\n(.*?)^```", text_of(page), re.MULTILINE | re.DOTALL)
+    ]
+    kinds = set()
+    for name, block in examples:
+        described = parse_rig(block, name)
+        open_stage(described)
+        kinds.add(described.stage.kind)
+    assert kinds == set(STAGES)
+
+
+def test_every_option_of_a_stage_is_documented_with_its_default():
+    pages = {"constant_speed": "unmoved.md", "encoder": "unmoved.md"}
+    for kind, known in STAGES.items():
+        text = text_of(DOCS / "devices" / pages.get(kind, f"{kind}.md"))
+        for option, spec in known.options.items():
+            row = re.search(rf"^\|[^|]*`{option}`[^|]*\| ([^|]+) \|", text, re.MULTILINE)
+            assert row is not None, f"{kind}: {option}"
+            said = row[1].strip("` ")
+            assert (
+                str(spec.default).lower().removesuffix(".0") in said.lower().replace(",", "") or "must be given" in said
+            )
+
+
+def test_all_fifteen_troubles_are_answered():
+    rows = re.findall(r"^\| (\d+) \| ([^|]+) \| ([^|]+) \|$", text_of(DOCS / "devices" / "index.md"), re.MULTILINE)
+    assert [int(row[0]) for row in rows] == list(range(1, 16))
+    assert all(len(row[2]) > 40 for row in rows)

@@ -3,16 +3,19 @@
 import asyncio
 import contextlib
 import json
+from typing import Any
 
 from fastapi import APIRouter, Depends, WebSocket
 from starlette.concurrency import run_in_threadpool
 from starlette.websockets import WebSocketDisconnect
 
+from scanner_service.api.access import Access, Identity
 from scanner_service.api.answers import plain
 from scanner_service.api.keys import Role
 from scanner_service.api.live_frames import MAX_POINTS, point_message
 from scanner_service.api.routes.sessions import status_answer
 from scanner_service.api.scopes import accepted_subprotocol, require
+from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SessionError
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.session import LiveSession
@@ -22,9 +25,15 @@ from scanner_service.storage.errors import RecordError, SessionUnknown
 router = APIRouter()
 UPDATE_PERIOD_S = 1 / 30
 STATUS_PERIOD_S = 0.5
+OPENING_PERIOD_S = 0.2
+ACCESS_PERIOD_S = 0.5
 MAX_CREDIT = 64
 MAX_REQUEST_CHARACTERS = 1024
 FINISHED, GOING_AWAY, POLICY, TRY_AGAIN_LATER, NOT_FOUND = 1000, 1001, 1008, 1013, 4404
+
+
+class AccessEnded(Exception):
+    """What the client showed when it connected does not hold any more."""
 
 
 class _Credit:
@@ -49,7 +58,9 @@ async def live(websocket: WebSocket, session_id: str) -> None:
     """Serve one client until it leaves, has everything there will ever be, or the session is closed."""
     await websocket.accept(subprotocol=accepted_subprotocol(websocket))
     try:
-        session = await run_in_threadpool(websocket.app.state.service.book.get, session_id)
+        session = await _opened(websocket, session_id)
+    except WebSocketDisconnect:
+        return
     except (RecordError, SessionError) as error:
         await _say(websocket, {"type": "error", "detail": str(error)})
         await websocket.close(NOT_FOUND if isinstance(error, SessionUnknown) else TRY_AGAIN_LATER)
@@ -61,14 +72,39 @@ async def live(websocket: WebSocket, session_id: str) -> None:
         asyncio.create_task(_send_points(websocket, session, credit, greeted)),
     ]
     all_sent = asyncio.gather(*sending)
+    watching = asyncio.create_task(_watch_access(websocket))
+    waited_for: tuple[asyncio.Future[Any], ...] = (watching, listening, all_sent)
     try:
-        done, _ = await asyncio.wait((listening, all_sent), return_when=asyncio.FIRST_COMPLETED)
+        done, _ = await asyncio.wait(waited_for, return_when=asyncio.FIRST_COMPLETED)
     finally:  # also when the server ends this task
-        for task in (listening, *sending):
+        for task in (watching, listening, *sending):
             task.cancel()
-        await asyncio.gather(listening, *sending, all_sent, return_exceptions=True)
-    ended = listening if listening in done else all_sent
+        await asyncio.gather(watching, listening, *sending, all_sent, return_exceptions=True)
+    ended = next(task for task in waited_for if task in done)
     await _part(websocket, ended.exception())
+
+
+async def _opened(websocket: WebSocket, session_id: str) -> LiveSession:
+    """The session; while its map is being built from the record, the client is told how far that is."""
+    book: SessionBook = websocket.app.state.service.book
+    getting = asyncio.ensure_future(run_in_threadpool(book.get, session_id))
+    while True:
+        done, _ = await asyncio.wait((getting,), timeout=OPENING_PERIOD_S)
+        if done:
+            return getting.result()
+        opening = book.opening(session_id)
+        if opening is not None:
+            told = {"type": "opening", "lines": opening.lines, "of": opening.of, "progress": opening.share}
+            await _say(websocket, told)
+
+
+async def _watch_access(websocket: WebSocket) -> None:
+    """Raise once the key that this stream was opened with is revoked, or the browser's login has ended."""
+    access: Access = websocket.app.state.access
+    who: Identity = websocket.state.identity
+    while access.still_holds(who):
+        await asyncio.sleep(ACCESS_PERIOD_S)
+    raise AccessEnded("the key or login that this stream was opened with is not valid any more")
 
 
 def _is_final(session: LiveSession) -> bool:
@@ -80,7 +116,7 @@ def _is_final(session: LiveSession) -> bool:
 async def _part(websocket: WebSocket, error: BaseException | None) -> None:
     """Say why the stream ends, when there is somebody left to be told."""
     match error:
-        case SessionError() | ValueError():
+        case SessionError() | AccessEnded() | ValueError():
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                 await _say(websocket, {"type": "error", "detail": str(error)})
                 await websocket.close(GOING_AWAY if isinstance(error, SessionError) else POLICY)

@@ -17,7 +17,7 @@ from scanner_service.api.answers import answer
 from scanner_service.api.errors import ExportUnknown, ValueUnusable
 from scanner_service.api.routes.sessions import Session, viewer
 from scanner_service.rescan.judgement import Reason
-from scanner_service.sessions.outputs import OUTPUT_FILES, summary_of, write_output
+from scanner_service.sessions.outputs import OUTPUT_FILES, outcome_of, summary_of, write_output
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.session import LiveSession
 from scanner_service.storage.exports.density_png import density_png
@@ -109,7 +109,7 @@ def list_regions(session: Session) -> Response:
 @router.get("/summary")
 def get_summary(session: Session) -> Response:
     """What summary.json holds."""
-    return answer(summary_of(session, results_of(session)))
+    return answer(summary_of(outcome_of(session, results_of(session))))
 
 
 @router.get("/export/{file_name}")
@@ -119,18 +119,18 @@ def export(session: Session, file_name: str) -> Response:
         raise ExportUnknown(f"there is no export {file_name}; ask for one of {', '.join(OUTPUT_FILES)}")
     folder = Path(tempfile.mkdtemp(prefix="scanner-export-"))
     try:
-        write_output(file_name, folder / file_name, session, results_of(session))
+        write_output(file_name, folder / file_name, outcome_of(session, results_of(session)))
     except BaseException:
         shutil.rmtree(folder)
         raise
-    return _PassingFile(
+    return PassingFile(
         folder / file_name,
         media_type=MEDIA_TYPES[Path(file_name).suffix],
         filename=f"{session.row.session_id}-{file_name}",
     )
 
 
-class _PassingFile(FileResponse):
+class PassingFile(FileResponse):
     """A file whose folder is removed after the answer, whatever that was: a background task is not run for each."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

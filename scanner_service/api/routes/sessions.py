@@ -1,5 +1,6 @@
-"""Sessions: create, list, start, stop, delete; every call is one call of the session book."""
+"""Sessions: create, list, start, pause, resume, stop, describe, delete; every call is one call of the session book."""
 
+import threading
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -7,14 +8,25 @@ from fastapi import APIRouter, Depends, Query, Request
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import Response
 
+from scanner_service.api.access import Identity
 from scanner_service.api.answers import answer
+from scanner_service.api.errors import NotConfirmed
+from scanner_service.api.idempotency import IdempotencyKey, creation_key
 from scanner_service.api.keys import Role
-from scanner_service.api.schemas import DeviceSourceIn, PassIn, PushSourceIn, ReplaySourceIn, SessionIn
+from scanner_service.api.schemas import (
+    DescriptionIn,
+    DeviceSourceIn,
+    PassIn,
+    PushSourceIn,
+    ReplaySourceIn,
+    RigSourceIn,
+    SessionIn,
+)
 from scanner_service.api.scopes import require
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.session import LiveSession
-from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, ReplaySpec, SourceSpec
+from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, ReplaySpec, RigSpec, SourceSpec
 from scanner_service.storage.formats.recording import ReadOptions
 from scanner_service.storage.rows import SessionRow
 
@@ -36,11 +48,16 @@ async def session_of(request: Request, session_id: str) -> LiveSession:
 Session = Annotated[LiveSession, Depends(session_of)]
 
 
-def spec_of(source: DeviceSourceIn | ReplaySourceIn | PushSourceIn, replay_dir: Path) -> SourceSpec:
+def spec_of(source: DeviceSourceIn | RigSourceIn | ReplaySourceIn | PushSourceIn, replay_dir: Path) -> SourceSpec:
     """What the request asks to read from."""
     match source:
         case DeviceSourceIn():
             return DeviceSpec(**source.model_dump(exclude={"kind"}))
+        case RigSourceIn():
+            rigs_dir = replay_dir.parent / "rigs"
+            if not rigs_dir.is_dir() or source.rig not in {item.name for item in rigs_dir.iterdir()}:
+                raise SourceUnusable(f"there is no file {source.rig} in the service's folder of rigs")
+            return RigSpec(rigs_dir / source.rig, **source.model_dump(exclude={"kind", "rig"}))
         case ReplaySourceIn():
             if source.file not in {item.name for item in replay_dir.iterdir()}:
                 raise SourceUnusable(f"there is no file {source.file} in the service's replay folder")
@@ -59,9 +76,11 @@ def row_answer(book: SessionBook, row: SessionRow) -> dict[str, Any]:
         "name": row.name,
         "state": row.state if live is None else live.state,
         "created": row.created_utc,
-        "lines": count.lines if count is not None else live.engine.ledger.received if live else 0,
+        "lines": count.lines if count is not None else live.engine.ledger.stored if live else 0,
         "points": count.points if count is not None else live.engine.ledger.counted if live else 0,
         "source": row.source,
+        "notes": row.notes,
+        "opening": _share(book, row.session_id),
     }
 
 
@@ -84,7 +103,16 @@ def status_answer(session: LiveSession) -> dict[str, Any]:
         "origin_mm": session.row.origin_mm,
         "settings": session.row.settings,
         "source": session.row.source,
+        "notes": session.row.notes,
+        "calibration": session.row.calibration,
+        "held": status.held,
+        "can_pause": session.can_pause,
     }
+
+
+def _share(book: SessionBook, session_id: str) -> float | None:
+    opening = book.opening(session_id)
+    return None if opening is None else opening.share
 
 
 @router.get("", dependencies=[viewer])
@@ -102,11 +130,20 @@ def list_sessions(
     )
 
 
-@router.post("", status_code=201, dependencies=[operator])
-def create_session(request: Request, body: SessionIn) -> Response:
-    """Make a session on a device, a replay file, or pushed scanlines. It does not scan before it is started."""
+@router.post("", status_code=201)
+def create_session(
+    request: Request,
+    body: SessionIn,
+    who: Annotated[Identity, operator],
+    idempotency_key: IdempotencyKey = None,
+) -> Response:
+    """Make a session on a device, a replay file, or pushed scanlines. It does not scan before it is started.
+
+    With an `Idempotency-Key` the request may be sent again: the answer is then about the session made at first.
+    """
+    key = creation_key(idempotency_key, who, body)
     spec = spec_of(body.source, request.app.state.service.replay_dir)
-    session = book_of(request).create(body.name, spec, body.settings.to_settings(), body.origin_mm)
+    session = book_of(request).create(body.name, spec, body.settings.to_settings(), body.origin_mm, key=key)
     location = {"Location": f"/api/v1/sessions/{session.row.session_id}"}
     return answer(status_answer(session), 201, location)
 
@@ -117,11 +154,68 @@ def get_session(session: Session) -> Response:
     return answer(status_answer(session))
 
 
+@router.patch("/{session_id}", dependencies=[operator])
+def describe_session(request: Request, session_id: str, body: DescriptionIn) -> Response:
+    """Change the name or the notes of a session."""
+    row = book_of(request).describe(session_id, name=body.name, notes=body.notes)
+    return answer(row_answer(book_of(request), row))
+
+
+@router.post("/{session_id}/open", status_code=202, dependencies=[operator])
+def open_session(request: Request, session_id: str) -> Response:
+    """Begin to reopen a session from the record: its live map is built from its lines. `GET` tells how far it is."""
+    book = book_of(request)
+    book.record.get_session(session_id)
+    if book.live(session_id) is None and book.opening(session_id) is None:
+        threading.Thread(target=book.open_quietly, args=(session_id,), name=f"opening-{session_id}").start()
+    return answer(_opening_answer(book, session_id), 202)
+
+
+@router.get("/{session_id}/open", dependencies=[viewer])
+def opening_of_session(request: Request, session_id: str) -> Response:
+    """Whether a session is open, and how far the building of its map is."""
+    book = book_of(request)
+    book.record.get_session(session_id)
+    return answer(_opening_answer(book, session_id))
+
+
+def _opening_answer(book: SessionBook, session_id: str) -> dict[str, Any]:
+    opening = book.opening(session_id)
+    return {
+        "id": session_id,
+        "is_open": book.live(session_id) is not None,
+        "lines": None if opening is None else opening.lines,
+        "of": None if opening is None else opening.of,
+        "progress": _share(book, session_id),
+        "failure": book.failure_to_open(session_id),
+    }
+
+
 @router.post("/{session_id}/start", dependencies=[operator])
 def start_session(session: Session) -> Response:
     """Begin to scan."""
     session.start()
     return answer(status_answer(session))
+
+
+@router.post("/{session_id}/pause", dependencies=[operator])
+def pause_session(session: Session) -> Response:
+    """Hold the scan: stage and laser of a device stop, pushed lines are refused until it is resumed."""
+    session.pause()
+    return answer(status_answer(session))
+
+
+@router.post("/{session_id}/resume", dependencies=[operator])
+def resume_session(session: Session) -> Response:
+    """Go on behind the last line; the laser of a device is switched on."""
+    session.resume()
+    return answer(status_answer(session))
+
+
+@router.get("/{session_id}/ledger", dependencies=[viewer])
+def get_ledger(session: Session) -> Response:
+    """What became of every line: sent = stored + under way + lost, by reason, for each device and pass."""
+    return answer(session.losses())
 
 
 @router.post("/{session_id}/stop", dependencies=[operator])
@@ -139,9 +233,19 @@ def withdraw_pass(session: Session, body: PassIn) -> Response:
 
 
 @router.delete("/{session_id}", status_code=204, dependencies=[admin])
-def delete_session(request: Request, session_id: str) -> Response:
-    """Delete the session and everything stored of it."""
-    book_of(request).delete(session_id)
+def delete_session(
+    request: Request, session_id: str, confirm: Annotated[str | None, Query(max_length=100)] = None
+) -> Response:
+    """Delete the session and everything stored of it; `confirm` is its id once more, so that none goes by mistake."""
+    book = book_of(request)
+    row = book.record.get_session(session_id)
+    if confirm != session_id:
+        count = book.record.count(session_id)
+        raise NotConfirmed(
+            f"this deletes session {session_id} ({row.name!r}, {count.lines} lines, {count.points} points) for good: "
+            f"say so with ?confirm={session_id}"
+        )
+    book.delete(session_id)
     return Response(status_code=204)
 
 

@@ -6,7 +6,7 @@ Only matplotlib's objects are used, on the Agg canvas: no global state, so sever
 from collections.abc import Sequence
 from functools import cache
 from io import BytesIO
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from matplotlib import colormaps
@@ -65,7 +65,7 @@ class OutlinedRegion(Protocol):
         """Closed loops; the last point is not repeated."""
 
 
-def density_png(
+def density_figure(
     snapshot: MapSnapshot,
     regions: Sequence[OutlinedRegion] = (),
     *,
@@ -76,7 +76,8 @@ def density_png(
     direction: Float64Array = _DOWN,
     colours: Colours = "viridis",
     dpi: int = 150,
-) -> bytes:
+    top_per_mm2: float | None = None,
+) -> Figure:
     """Draw the density of the surface seen along `direction`; 11 inches wide, at most 8.25 high, at `dpi`.
 
     The scale is absolute, in points per mm², from 0 to the 98th percentile of the judged points. Points that are not
@@ -88,6 +89,7 @@ def density_png(
     required_per_mm2 : marked on the scale; NaN if unknown.
     direction : (3,) the way the eye looks, part frame; down z by default: x to the right, y up.
     colours : "viridis", or "blue-red" (blue dense, red sparse).
+    top_per_mm2 : end of the scale, so that two pictures can be compared; None takes it from the data.
 
     Raises
     ------
@@ -108,9 +110,7 @@ def density_png(
     _frame(part, view)
     colour_map: Colormap = _BLUE_RED if colours == "blue-red" else colormaps["viridis"]
     densities = snapshot.density_per_mm2[judged(snapshot)]
-    top = _rounded_up(float(np.percentile(densities, 98))) if len(densities) else 1.0
-    if np.isfinite(required_per_mm2):
-        top = max(top, _rounded_up(1.05 * required_per_mm2))
+    top = scale_top_per_mm2(snapshot, required_per_mm2) if top_per_mm2 is None else top_per_mm2
     if raster is not None:
         _surface(part, raster, colour_map, top)
         shown = _outlines(part, regions, view)
@@ -121,9 +121,24 @@ def density_png(
         part.set_xticks([])
         part.set_yticks([])
     _scale(scale, densities, colour_map, top, required_per_mm2)
+    return figure
+
+
+def density_png(
+    snapshot: MapSnapshot, regions: Sequence[OutlinedRegion] = (), *, session_name: str, **options: Any
+) -> bytes:
+    """The picture of `density_figure` as a PNG; takes what that takes and raises what that raises."""
+    figure = density_figure(snapshot, regions, session_name=session_name, **options)
     picture = BytesIO()
-    figure.savefig(picture, format="png", metadata={"Title": _drawable(session_name), "Software": "scanner-service"})
+    figure.savefig(picture, format="png", metadata={"Title": drawable(session_name), "Software": "scanner-service"})
     return picture.getvalue()
+
+
+def scale_top_per_mm2(snapshot: MapSnapshot, required_per_mm2: float = float("nan")) -> float:
+    """Where the scale of a picture of this map ends: at the 98th percentile, and not below the requirement."""
+    densities = snapshot.density_per_mm2[judged(snapshot)]
+    top = _rounded_up(float(np.percentile(densities, 98))) if len(densities) else 1.0
+    return max(top, _rounded_up(1.05 * required_per_mm2)) if np.isfinite(required_per_mm2) else top
 
 
 def _title(figure: Figure, session_name: str, when: str, coverage: float, snapshot: MapSnapshot) -> None:
@@ -134,9 +149,9 @@ def _title(figure: Figure, session_name: str, when: str, coverage: float, snapsh
         facts.insert(0, f"observed coverage {100 * coverage:.1f} %")
     if when:
         facts.append(when)
-    title = figure.suptitle(_drawable(session_name), fontsize=15, fontweight="bold", color=_INK, fontfamily=_FONT)
+    title = figure.suptitle(drawable(session_name), fontsize=15, fontweight="bold", color=_INK, fontfamily=_FONT)
     title.set_parse_math(False)
-    second = figure.axes[0].set_title(_drawable("  ·  ".join(facts)), fontsize=10, color="#555555", fontfamily=_FONT)
+    second = figure.axes[0].set_title(drawable("  ·  ".join(facts)), fontsize=10, color="#555555", fontfamily=_FONT)
     second.set_parse_math(False)
 
 
@@ -243,7 +258,7 @@ def _legend(
     keys: list[Line2D | Patch] = [Patch(facecolor=_NOT_JUDGED, label="not judged (unreliable or not settled)")]
     for reason, count in shown.items():
         style = _STYLES.get(reason, _OTHER_STYLE)
-        label = _drawable(f"{reason.replace('_', ' ')}: {count} region{'s' if count > 1 else ''}")
+        label = drawable(f"{reason.replace('_', ' ')}: {count} region{'s' if count > 1 else ''}")
         keys.append(Line2D([], [], color="black", linewidth=1.4, linestyle=style, label=label))
     legend = figure.legend(
         handles=keys,
@@ -301,6 +316,6 @@ def _glyphs() -> frozenset[int]:
     return frozenset(get_font(findfont(_FONT)).get_charmap())
 
 
-def _drawable(text: str) -> str:
+def drawable(text: str) -> str:
     """Text with a replacement sign for what the font cannot draw, on one line."""
     return "".join(sign if ord(sign) in _glyphs() else "\ufffd" for sign in " ".join(text.split()))

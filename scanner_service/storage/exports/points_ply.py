@@ -5,15 +5,17 @@ Scalars are named `scalar_*`: a well-known viewer drops other names without a wo
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
 from drivers.scanline import BoolArray
 from scanner_service import __version__
 from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.storage.exports.about import About
+from scanner_service.storage.exports.point_stream import PointBlock, PointStream, stream_of
 from scanner_service.storage.exports.whole_file import whole_file
 
-_BLOCK = 1 << 16
 ROW = np.dtype(
     [
         *((name, "<f8") for name in ("x", "y", "z", "scalar_radius", "nx", "ny", "nz")),
@@ -27,11 +29,7 @@ _PLY_TYPES = {"<f8": "double", "<f4": "float", "<i4": "int"}
 def write_points_ply(
     path: Path, snapshot: MapSnapshot, rescan: BoolArray, *, version: str = __version__, comments: Sequence[str] = ()
 ) -> None:
-    """Write all points of a snapshot, in its order, binary little endian, millimetres, part frame.
-
-    x y z are the stored coordinates without rounding. `scalar_neighbours` counts the point itself, `scalar_laser_*` is
-    the laser position of the point's own scanline, `scalar_scanline` that scanline's row in the line table. A normal
-    that is not reliable is NaN. The file appears under its name when it is whole.
+    """Write all points of a snapshot, in its order, as `write_ply` does, whole or not at all.
 
     Parameters
     ----------
@@ -44,13 +42,23 @@ def write_points_ply(
     ValueError : `rescan` has not one value a point.
     ExportNotWritten, ExportNotConfirmed : the file system refused.
     """
-    total = len(snapshot)
-    if rescan.shape != (total,):
-        raise ValueError(f"rescan must have shape ({total},), not {rescan.shape}")
+    stream = stream_of(snapshot, rescan)
     with whole_file(path) as file:
-        file.write(_header(total, version, comments))
-        for start in range(0, total, _BLOCK):
-            file.write(_rows(snapshot, rescan, slice(start, min(start + _BLOCK, total))).tobytes())
+        write_ply(file, stream, About(version=version), comments)
+
+
+def write_ply(file: BinaryIO, stream: PointStream, about: About, comments: Sequence[str] = ()) -> None:
+    """Write points, binary little endian, millimetres, part frame.
+
+    x y z are the stored coordinates without rounding. `scalar_neighbours` counts the point itself, `scalar_laser_*` is
+    the laser position of the point's own scanline, `scalar_scanline` that scanline's row in the line table. A normal
+    that is not reliable is NaN. `scalar_rescan` is NaN where nothing was judged.
+    """
+    if about.session_id:
+        comments = (*comments, f"about {about.to_text()}")
+    file.write(_header(stream.total, about.version, comments))
+    for block in stream.blocks():
+        file.write(_rows(block).tobytes())
 
 
 def _header(total: int, version: str, comments: Sequence[str]) -> bytes:
@@ -66,19 +74,18 @@ def _header(total: int, version: str, comments: Sequence[str]) -> bytes:
     return ("\n".join(printable) + "\n").encode("ascii", "backslashreplace")
 
 
-def _rows(snapshot: MapSnapshot, rescan: BoolArray, part: slice) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-    rows = np.empty(part.stop - part.start, dtype=ROW)
-    line = snapshot.line[part]
-    laser = snapshot.lines.laser_mm[line]
-    normals = np.where(snapshot.reliable[part, None], snapshot.normals[part], np.nan)
+def _rows(block: PointBlock) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+    points = block.points
+    rows = np.empty(len(block), dtype=ROW)
+    laser, normals = block.laser_mm, block.normals
     for axis, name in enumerate("xyz"):
-        rows[name] = snapshot.points_mm[part, axis]
+        rows[name] = points.points_mm[:, axis]
         rows[f"n{name}"] = normals[:, axis]
         rows[f"scalar_laser_{name}"] = laser[:, axis]
-    rows["scalar_radius"] = snapshot.radius_mm[part]
-    rows["scalar_density"] = snapshot.density_per_mm2[part]
-    rows["scalar_reliable"] = snapshot.reliable[part]
-    rows["scalar_rescan"] = rescan[part]
-    rows["scalar_neighbours"] = snapshot.neighbours[part]
-    rows["scalar_scanline"] = line
+    rows["scalar_radius"] = points.radius_mm
+    rows["scalar_density"] = points.density_per_mm2
+    rows["scalar_reliable"] = points.reliable
+    rows["scalar_rescan"] = np.nan if block.rescan is None else block.rescan
+    rows["scalar_neighbours"] = points.neighbours
+    rows["scalar_scanline"] = points.line
     return rows

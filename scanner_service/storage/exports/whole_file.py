@@ -43,6 +43,38 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
     _sync_folder(path)
 
 
+@contextmanager
+def whole_path(path: Path) -> Iterator[Path]:
+    """A path beside `path` for a library that wants to open the file itself; renamed as `whole_file` does.
+
+    The block must leave a closed file there. What it leaves beside that one (`-wal`, `-journal`) is removed.
+
+    Raises
+    ------
+    ExportNotWritten, ExportNotConfirmed : as `whole_file`.
+    """
+    path = Path(path)
+    beside: Path | None = None
+    try:
+        beside, descriptor = _open_beside(path)
+        os.close(descriptor)
+        yield beside
+        with beside.open("rb") as file:
+            os.fsync(file.fileno())
+        beside.replace(path)
+    except OSError as error:
+        _remove(beside)
+        raise ExportNotWritten(f"{path} cannot be written: {error.strerror or error}") from error
+    except BaseException:
+        _remove(beside)
+        raise
+    finally:
+        if beside is not None:
+            for ending in ("-wal", "-shm", "-journal"):
+                _remove(beside.with_name(beside.name + ending))
+    _sync_folder(path)
+
+
 def write_whole(path: Path, content: bytes) -> None:
     """Write `content` to `path`, whole or not at all.
 

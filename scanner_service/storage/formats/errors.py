@@ -11,6 +11,7 @@ FormatError
 ├── NoScanlines         a plain cloud where scanlines are needed
 ├── LaserUnknown        nothing tells where the laser stood
 ├── SpacingUnknown      nothing tells how far apart the scanlines are
+├── LibraryAbsent       the format needs a library that is not installed
 └── OptionRefused       an option that cannot be meant
 """
 
@@ -57,6 +58,10 @@ class LaserUnknown(FormatError):
 
 class SpacingUnknown(FormatError):
     """Nothing tells how far apart the scanlines are."""
+
+
+class LibraryAbsent(FormatError):
+    """The format needs a library that is not installed; the message says how to install it."""
 
 
 class OptionRefused(FormatError):

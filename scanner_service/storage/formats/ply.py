@@ -1,7 +1,6 @@
 """A PLY file as vertices in millimetres with their range grid, if it has one; knows no laser and no spacing."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -12,13 +11,9 @@ from scanner_service.storage.formats.ply_body import Ragged, read_rows
 from scanner_service.storage.formats.ply_header import PlyHeader, check_size, parse_header
 from scanner_service.storage.formats.recording import MM_PER_UNIT, Cloud, Units, finite_rows
 from scanner_service.storage.formats.text_numbers import CUT_NOTE
+from scanner_service.storage.formats.units import MILLIMETRES, given_or_named
 
 Int64Array = npt.NDArray[np.int64]
-_UNIT_WORDS = {
-    **dict.fromkeys(("mm", "millimetre", "millimeter", "millimetres", "millimeters"), "mm"),
-    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), "m"),
-    **dict.fromkeys(("inch", "inches", "in"), "inch"),
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,19 +103,15 @@ def is_cyberware(header: PlyHeader) -> bool:
 
 def _decide_units(header: PlyHeader, given: Units | None) -> tuple[str, str]:
     """The unit and the sentence that says why: given, named in the header, usual for the scanner, or millimetres."""
-    if given is not None and given != "auto":
-        return given, f"lengths are read as {given}, as given"
-    for text in (*header.comments, *(f"{key} {value}" for key, value in header.obj_info.items())):
-        words = text.lower().replace(":", " ").replace("=", " ").replace(",", " ").split()
-        for before, word in pairwise(words):
-            if before in ("unit", "units") and word in _UNIT_WORDS:
-                return _UNIT_WORDS[word], f"lengths are read as {_UNIT_WORDS[word]}: the header says so"
+    told = given_or_named(given, (*header.comments, *(f"{key} {value}" for key, value in header.obj_info.items())))
+    if told is not None:
+        return told
     if is_cyberware(header) or header.element("range_grid") is not None:
         return (
             "m",
             "lengths are read as metres, as range grids of the Stanford kind are; give the units if they are not",
         )
-    return "mm", "lengths are read as millimetres, since the file names no unit; give the units if they are not"
+    return MILLIMETRES
 
 
 def _check_indices(grid: Ragged, vertices: int, name: str) -> None:

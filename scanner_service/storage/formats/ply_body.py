@@ -119,10 +119,11 @@ def _read_binary(header: PlyHeader, data: bytes, name: str) -> dict[str, Rows]:
             if len(data) - at < element.count * kinds.itemsize:
                 raise _ends_within(name, element, (len(data) - at) // max(kinds.itemsize, 1))
             table = np.frombuffer(data, dtype=kinds, count=element.count, offset=at) if element.count else None
-            scalars = {
-                item.name: np.empty(0) if table is None else table[item.name].astype(np.float64)
-                for item in element.properties
-            }
+            with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
+                scalars = {
+                    item.name: np.empty(0) if table is None else table[item.name].astype(np.float64)
+                    for item in element.properties
+                }
             rows[element.name] = Rows(scalars, {})
             at += element.count * kinds.itemsize
     if data[at:].strip():
@@ -161,7 +162,8 @@ def _binary_ragged(element: Element, order: str, data: bytes, at: int, name: str
         length = np.array(counts[column], dtype=np.int64) if item.count_type else np.ones(len(starts), dtype=np.int64)
         width = int(item.value_type[1:])
         picked = raw[_ranges(starts, length * width)]
-        values = picked.view(f"{order}{item.value_type}").astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            values = picked.view(f"{order}{item.value_type}").astype(np.float64)
         if item.count_type:
             rows.lists[item.name] = Ragged(length, values)
         else:

@@ -12,6 +12,10 @@ const NAMES = {
   bad_cobs: "broken framing",
   bytes_skipped: "bytes skipped",
   points_declared: "points in the file",
+  under_way: "under way",
+  record_busy: "the disk failed",
+  service_ended: "under way when the service ended",
+  too_late: "after the end",
 };
 
 const PLACES = { missing: "in a piece that never arrived" };
@@ -24,7 +28,7 @@ const rows = (tally, kind, prefix = "") => Object.entries(tally ?? {}).map(([key
 
 // [{title, unit, total, rows}], the total being null where nothing adds up to one.
 export function accounts(losses) {
-  const { lines, points, device, ...others } = losses ?? {};
+  const { lines, points, device, passes, ...others } = losses ?? {};
   const made = [];
   if (points) {
     const kinds = Object.entries(points.dropped ?? {}).map(([key, count]) => row(PLACES[key] ?? key, count, key === "dropout" ? "aside" : "lost"));
@@ -34,9 +38,22 @@ export function accounts(losses) {
     const fate = [row("stored", lines.stored, "kept"), row("pending", lines.pending, "aside"), row("duplicates", lines.duplicates, "aside"), row("conflicts", lines.conflicts, "lost")];
     made.push({ title: "Scanlines", unit: "received", total: lines.received, rows: [...fate, ...rows(lines.refused, "lost", "refused: ")] });
   }
+  made.push(...passAccounts(passes ?? []));
   if (device) made.push(...(device.lines ? wireAccounts(device) : fileAccounts(device)));
   for (const [key, tally] of Object.entries(others)) made.push({ title: sentence(key), unit: "", total: null, rows: rows(flat(tally, key), "aside") });
   return made;
+}
+
+const LATEST_PASSES = 12;
+
+// One balance a pass, from the wire to the record: sent = stored (whole, partial) + under way + lost; the latest ones.
+function passAccounts(passes) {
+  return passes.slice(-LATEST_PASSES).map(({ device_id: device, pass_index: pass, boot_id: boot, lines }) => {
+    const boots = new Set(passes.filter((other) => other.device_id === device).map((other) => other.boot_id));
+    const name = `Pass ${pass} of ${device}${boots.size > 1 ? `, boot ${boot}` : ""}`;
+    const kept = [row("whole", lines.whole, "kept"), row("partial", lines.partial, "lost")];
+    return { title: name, unit: "scanlines sent", total: lines.sent, rows: [...kept, row("under_way", lines.under_way, "aside"), ...rows(lines.lost, "lost", "lost: ")] };
+  });
 }
 
 function wireAccounts({ lines, chunks, damage, bytes_skipped: bytesSkipped, duplicates, stale, disagreements }) {

@@ -2,24 +2,24 @@
 
 import { SCALES } from "./colours.js";
 import { byId, element } from "./element.js";
+import { ExportMenu } from "./exports.js";
 import { drawRuler, drawTriad } from "./gauges.js";
 import { listenToKeys } from "./keyboard.js";
 import { drawLegend } from "./legend.js";
-import { words } from "./numbers.js";
+import { whole, words } from "./numbers.js";
 import { drawFigures, drawInspector, drawLosses, drawRegions } from "./panels.js";
 import { PassesPanel } from "./passes_panel.js";
 import { pickPoint } from "./picking.js";
 import { PointCloud } from "./point_cloud.js";
 import { RegionOverlay } from "./region_overlay.js";
 import { SceneView } from "./scene_view.js";
-import { exportAddress, listSessions, startSession, stopSession } from "./service.js";
+import { listSessions, pauseSession, resumeSession, startSession, stopSession } from "./service.js";
 import { SessionPicker } from "./session_picker.js";
 import { OVER, SessionView } from "./session_view.js";
 
 const TROUBLE_MS = 15000;
 const SURVEY_MS = 1000;
 const CLICK_SLACK_PX = 4;
-const EXPORTS = { "points.ply": "points with normals, density and flags", "density.png": "density map as a picture", "regions.json": "rescan regions", "summary.json": "summary of the session" };
 
 const look = { rule: "density", scale: "viridis", range: [0, 1], autoRange: true, pointScale: 1 };
 let chosenRegion = null;
@@ -28,7 +28,7 @@ let connectionState = "none";
 let frames = 0;
 let troubled = { text: "", until: 0 };
 
-const session = new SessionView({ points, status, regions, connection, trouble });
+const session = new SessionView({ points, status, regions, opening, connection, trouble });
 const view = openView();
 const cloud = new PointCloud(session.store);
 const overlay = new RegionOverlay(byId("labels"), chooseRegion);
@@ -37,6 +37,7 @@ byId("view").append(marker);
 view.scene.add(cloud.object, overlay.group);
 
 const passes = new PassesPanel(trouble, () => session.open(session.id));
+const exports = new ExportMenu(byId("export-links"), byId("exports"));
 const picker = new SessionPicker({ onChoose: openSession, onMissing: (text) => notice(text), current: () => session.id });
 
 function openView() {
@@ -71,6 +72,8 @@ function status() {
   state.dataset.state = told.state;
   byId("stop").hidden = OVER.has(told.state) || told.state === "created";
   byId("start").hidden = !session.startable;
+  byId("pause").hidden = told.state !== "scanning" || !told.can_pause;
+  byId("resume").hidden = told.state !== "paused" || !told.held;
   byId("start").textContent = told.state === "created" ? "Start" : "Go on";
   byId("stop-note").hidden = byId("stop").hidden;
   explainEmptiness();
@@ -81,6 +84,15 @@ function status() {
   say();
   drawFigures(byId("figures"), told, session.store, session.box);
   drawLosses(byId("losses"), byId("losses-count"), told.losses);
+}
+
+// The service builds the map of a closed session from the record, line by line.
+function opening({ lines, of, progress: share }) {
+  notice(`Opening from the record: ${whole(lines)} of ${whole(of)} scanlines`);
+  const progress = byId("progress");
+  progress.hidden = false;
+  progress.value = share;
+  progress.dataset.state = "opening";
 }
 
 function regions() {
@@ -182,7 +194,7 @@ function openSession(chosen) {
   byId("session-name").textContent = chosen.name || chosen.id;
   document.title = `${chosen.name || chosen.id} – scan viewer`;
   byId("session-state").hidden = true;
-  byId("start").hidden = byId("stop").hidden = true;
+  for (const id of ["start", "pause", "resume", "stop"]) byId(id).hidden = true;
   history.replaceState(null, "", `?session=${encodeURIComponent(chosen.id)}`);
   chosenRegion = null;
   inspect(-1);
@@ -198,7 +210,7 @@ function openSession(chosen) {
   drawRegions(byId("regions"), byId("regions-count"), null, null, chooseRegion);
   byId("legend").hidden = true;
   byId("exports").hidden = false;
-  byId("export-links").replaceChildren(...Object.entries(EXPORTS).map(([file, text]) => element("li", {}, element("a", { href: exportAddress(chosen.id, file), download: file }, file, element("span", {}, text)))));
+  exports.open(chosen.id);
   view.invalidate();
 }
 
@@ -314,6 +326,8 @@ function listen() {
     });
   }
   byId("start").addEventListener("click", (event) => command(event.currentTarget, startSession));
+  byId("pause").addEventListener("click", (event) => command(event.currentTarget, pauseSession));
+  byId("resume").addEventListener("click", (event) => command(event.currentTarget, resumeSession));
   byId("stop").addEventListener("click", (event) => command(event.currentTarget, stopSession));
   byId("retry").addEventListener("click", () => session.retryNow());
   addEventListener("online", () => session.retryNow());

@@ -104,7 +104,7 @@ export function drawInspector(place, store, row, origin, onClose) {
   );
 }
 
-export function drawSessions(place, sessions, chosen, describe, onChoose) {
+export function drawSessions(place, sessions, chosen, describe, onChoose, onDelete = null) {
   const item = (session) =>
     element(
       "li",
@@ -116,6 +116,7 @@ export function drawSessions(place, sessions, chosen, describe, onChoose) {
         element("span.badge", { "data-state": session.state }, words(session.state)),
         element("span.detail", {}, describe(session)),
       ),
+      onDelete ? element("button.quiet.delete", { type: "button", title: "Delete this session", "aria-label": `Delete ${session.name || session.id}`, onclick: () => onDelete(session.id) }, "Delete…") : null,
     );
   place.replaceChildren(...(sessions.length ? sessions.map(item) : [element("li.empty", {}, "No session yet. Start one on a device, replay a file, or run the demonstration.")]));
 }

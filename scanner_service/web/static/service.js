@@ -47,6 +47,23 @@ export const carryOut = (id, order, turned) => send(sessionPath(id, `pass-orders
 export const startLoop = (id) => send(sessionPath(id, "rescan"), {});
 
 export const endLoop = (id) => answer(sessionPath(id, "rescan"), { method: "DELETE" });
+export const pauseSession = (id) => answer(sessionPath(id, "pause"), { method: "POST" });
+
+export const resumeSession = (id) => answer(sessionPath(id, "resume"), { method: "POST" });
+
+// `confirm` is the id once more: the service deletes nothing without it.
+export const deleteSession = (id) => answer(`api/v1/sessions/${encodeURIComponent(id)}?confirm=${encodeURIComponent(id)}`, { method: "DELETE" });
+
+const JSON_BODY = { "content-type": "application/json" };
+
+// {formats, exports}: what can be written, and what was.
+export const listExports = (id) => answer(sessionPath(id, "exports"));
+
+export const orderExport = (id, formats) => answer(sessionPath(id, "exports"), { method: "POST", headers: { accept: "application/json", ...JSON_BODY }, body: JSON.stringify({ formats }) });
+
+export const getExport = (id, job) => answer(sessionPath(id, `exports/${encodeURIComponent(job)}`));
+
+export const fileAddress = (id, job, file) => address(sessionPath(id, `exports/${encodeURIComponent(job)}/files/${encodeURIComponent(file)}`));
 
 export const exportAddress = (id, file) => address(sessionPath(id, `export/${file}`));
 

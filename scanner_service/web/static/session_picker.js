@@ -3,7 +3,7 @@
 import { byId } from "./element.js";
 import { moment } from "./numbers.js";
 import { drawSessions, sessionDetail } from "./panels.js";
-import { listSessions } from "./service.js";
+import { deleteSession, listSessions } from "./service.js";
 import { OVER } from "./session_view.js";
 
 const RETRY_MS = 1000;
@@ -73,6 +73,20 @@ export class SessionPicker {
       this.dialog.close();
       this.onChoose(this.#sessions.find((session) => session.id === id));
     };
-    drawSessions(byId("session-list"), newestFirst(this.#sessions), this.current(), (session) => sessionDetail(session, moment(session.created)), choose);
+    drawSessions(byId("session-list"), newestFirst(this.#sessions), this.current(), (session) => sessionDetail(session, moment(session.created)), choose, (id) => this.#delete(id));
+  }
+
+  // Asks first, and says what would go.
+  async #delete(id) {
+    const session = this.#sessions.find((candidate) => candidate.id === id);
+    if (!confirm(`Delete "${session.name || id}" for good? It holds ${sessionDetail(session, moment(session.created))}.`)) return;
+    const message = byId("sessions-message");
+    try {
+      await deleteSession(id);
+      await this.#load(null);
+    } catch (refusal) {
+      message.hidden = false;
+      message.textContent = refusal.message;
+    }
   }
 }

@@ -20,7 +20,7 @@ export class SessionView {
   #owed = 0; // binary messages taken in but not drawn yet; credit for them follows the picture
   #surveyed = null;
 
-  // tell: {points(), status(), regions(), connection(state), trouble(text)}
+  // tell: {points(), status(), regions(), opening(told), connection(state), trouble(text)}
   constructor(tell) {
     this.tell = tell;
   }
@@ -118,6 +118,8 @@ export class SessionView {
     } else if (message.type === "regions") {
       this.regions = [...message.regions].sort((a, b) => (b.priority ?? 0) - (a.priority ?? 0) || a.number - b.number);
       this.tell.regions();
+    } else if (message.type === "opening") {
+      this.tell.opening(message);
     } else if (message.type === "error") {
       this.tell.trouble(message.detail);
     }

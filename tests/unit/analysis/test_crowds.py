@@ -67,7 +67,8 @@ def test_a_million_points_in_one_place_are_a_million_points():
     assert (snapshot.unreliable == Unreliable.ILL_DETERMINED).all()
 
 
-def test_a_crowd_that_is_withdrawn_leaves_nothing(rng=np.random.default_rng(3)):
+def test_a_crowd_that_is_withdrawn_leaves_nothing():
+    rng = np.random.default_rng(3)
     live = LiveMap(MapSettings(max_points=60_000, noise_mm=0.01))
     stays = [crowd(rng, line, places=12, copies=20) for line in range(3)]
     goes = [crowd(rng, line, places=12, copies=60, device="B") for line in range(3)]

@@ -3,7 +3,7 @@
 import anyio
 import pytest
 
-from scanner_service.api.routes.results import _PassingFile
+from scanner_service.api.routes.results import PassingFile
 
 
 @pytest.mark.parametrize("range_asked", [None, b"bytes=0-1", b"bytes=nonsense", b"bytes=99-"])
@@ -21,6 +21,6 @@ def test_an_export_leaves_nothing_behind(tmp_path, range_asked):
 
     headers = [] if range_asked is None else [(b"range", range_asked)]
     scope = {"type": "http", "method": "GET", "path": "/", "headers": headers, "asgi": {"spec_version": "2.4"}}
-    anyio.run(_PassingFile(folder / "summary.json"), scope, receive, send)
+    anyio.run(PassingFile(folder / "summary.json"), scope, receive, send)
     assert sent[0]["status"] in (200, 206, 400, 416)
     assert not folder.exists()

@@ -12,18 +12,30 @@ from drivers.protocols.native_messages import Chunk, EndReason, Hello, PositionK
 from drivers.protocols.native_stream import ProfileStream
 from drivers.protocols.unwrap import increase_u32, unwrap_u32
 from drivers.scanline import DeviceInfo, Profile, SensorGeometry
-from drivers.tally import BootLedger, Kind, Tally
+from drivers.tally import BootLedger, Kind, PassTally, Tally
 
 U32 = 2**32
 GEOMETRY = SensorGeometry(np.zeros(3), np.zeros(3), (-1.0, 1.0), 0.001)
+
+
+LINES_A_PASS = 4
+
+
+def pass_of(line: int, first: int) -> int:
+    """The pass of a line: a new one every few lines."""
+    return 1 + (line - first) // LINES_A_PASS
 
 
 def hello(boot_id: int, status: Status) -> Hello:
     return Hello(0, DeviceInfo("S", "M", "F", "C", boot_id, 3, GEOMETRY), 0.0, 0.5, status)
 
 
-def status(boot_id: int, sequence: int, line: int, chunks: int, lines: int) -> Status:
-    return Status(boot_id, True, True, EndReason.NONE, 1, sequence % U32, line % U32, chunks % U32, lines % U32)
+def status(
+    boot_id: int, sequence: int, line: int, chunks: int, lines: int, pass_index: int = 1, runs: bool = True
+) -> Status:
+    return Status(
+        boot_id, True, runs, EndReason.NONE, pass_index, sequence % U32, line % U32, chunks % U32, lines % U32
+    )
 
 
 @dataclass(frozen=True)
@@ -50,7 +62,7 @@ def device(draw: st.DrawFn, boot_id: int, first: int, n_lines: int, chunks_a_lin
             chunk = Chunk(
                 boot_id,
                 number % U32,
-                1,
+                pass_of(line, first),
                 line % U32,
                 0,
                 PositionKind.STAGE_NM,
@@ -83,13 +95,13 @@ def schedules(draw: st.DrawFn) -> tuple[list[list[Sent]], int, int]:
     return boots, first, chunks_a_line
 
 
-def totals_after(sent: list[Sent], boot_id: int, first: int) -> Status:
+def totals_after(sent: list[Sent], boot_id: int, first: int, pass_index: int, runs: bool = True) -> Status:
     number, line = (sent[-1].number + 1, sent[-1].line + 1) if sent else (first, first)
     dropped = first + sum(item.fate == "device" for item in sent)
     lines: dict[int, bool] = {}
     for item in sent:
         lines[item.line] = lines.get(item.line, True) and item.fate == "device"
-    return status(boot_id, number, line, dropped, first + sum(lines.values()))
+    return status(boot_id, number, line, dropped, first + sum(lines.values()), pass_index, runs)
 
 
 @settings(max_examples=300, deadline=None)
@@ -109,13 +121,27 @@ def test_sent_is_stored_and_lost_by_reason_over_drops_damage_wraps_and_reboots(
 
     start = status(100, first, first, first, first)
     stream = ProfileStream(hello(100, start), deliver)
+    sent_of: Counter[tuple[int, int]] = Counter()
     truth: Counter[str] = Counter()
     n_damaged = 0
     for boot, sent in enumerate(boots):
         base = first if boot == 0 else 0
         stream.totals(status(100 + boot, base, base, base, base))
-        for item in sent:
+        known = {1}
+        for at, item in enumerate(sent):
             truth[item.fate] += 1
+            sent_of[item.boot_id, item.chunk.pass_index] += 1
+            if at and item.chunk.pass_index != sent[at - 1].chunk.pass_index:  # END of one pass, or START of the next
+                before = sent[at - 1].chunk.pass_index
+                is_known = before in known or any(
+                    item.fate in ("arrives", "twice") for item in sent[:at] if item.chunk.pass_index == before
+                )
+                ended = (
+                    data.draw(st.booleans()) if is_known else True
+                )  # of a pass that nobody heard of, its end at least
+                known |= set() if ended else {item.chunk.pass_index}
+                told = sent[at - 1].chunk.pass_index if ended else item.chunk.pass_index
+                stream.totals(totals_after(sent[:at], 100 + boot, base, told, runs=not ended))
             if item.fate == "damaged":
                 stream.damage(Damage(DamageReason.BAD_CRC, 97))
                 n_damaged += 1
@@ -124,7 +150,8 @@ def test_sent_is_stored_and_lost_by_reason_over_drops_damage_wraps_and_reboots(
             tally = stream.tally()
             assert tally.chunks.balances
             assert tally.lines.balances
-        stream.totals(totals_after(sent, 100 + boot, base))
+            assert all(told.chunks.balances and told.lines.balances for told in tally.passes.values())
+        stream.totals(totals_after(sent, 100 + boot, base, sent[-1].chunk.pass_index if sent else 1))
         stream.close_line()
     tally = stream.tally()
     n_lines = sum(len(sent) // chunks_a_line for sent in boots)
@@ -152,6 +179,10 @@ def test_sent_is_stored_and_lost_by_reason_over_drops_damage_wraps_and_reboots(
     lost_lines = Counter(tally.lines.lost)
     assert sum(lost_lines.values()) - lost_lines["host_overflow"] == len(dark)
     assert lost_lines["device_dropped"] == sum(all(item.fate == "device" for item in line) for line in dark)
+    assert sum(tally.passes.values(), PassTally()) == PassTally(tally.chunks, tally.lines)
+    assert {key: told.chunks.sent for key, told in tally.passes.items()} == dict(sent_of)
+    of_pass = Counter((profile.boot_id, profile.pass_index) for profile in delivered)
+    assert {key: told.lines.stored for key, told in tally.passes.items() if told.lines.stored} == dict(of_pass)
     numbers = [(profile.boot_id, profile.line_index) for profile in delivered]
     assert numbers == sorted(set(numbers))
 
@@ -166,13 +197,16 @@ def test_chunks_out_of_order_are_stored_or_late_and_never_counted_twice(
     for at in [*order, *again]:
         line, place = divmod(at, chunks_a_line)
         chunk = Chunk(
-            1, (first + at) % U32, 1, (first + line) % U32, 0, PositionKind.NONE, 0, (0, 0, 0), 1, 1, 0, 0,
+            1, (first + at) % U32, 1 + line // 3, (first + line) % U32, 0, PositionKind.NONE, 0, (0, 0, 0), 1, 1, 0, 0,
             chunks_a_line, place, np.array([[1, 1]], dtype=np.int32),
         )  # fmt: skip
         stream.chunk(chunk, 0.0)
         assert stream.tally().chunks.balances
         assert stream.tally().lines.balances
+        assert all(told.chunks.balances and told.lines.balances for told in stream.tally().passes.values())
     tally = stream.tally()
+    sent_of = Counter((1, 1 + at // chunks_a_line // 3) for at in order)
+    assert {key: told.chunks.sent for key, told in tally.passes.items()} == dict(sent_of)  # all came in the end
     # What comes before the first number that was read is older than the account only where the account says so.
     assert tally.chunks.sent == 12
     assert tally.duplicates == len(again)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from scanner_service.storage.errors import LineDamaged, RecordError, SessionDamaged
+from scanner_service.storage.errors import LineDamaged, SessionDamaged
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import DamagedLine
@@ -102,33 +102,3 @@ def test_damaged_sessions_and_events_are_marked_and_do_not_stop_a_list(stored: t
             record.set_state(session, "closed")
         assert len(record.verify(session).problems) >= 3
         record.delete_session(session)
-
-
-def flips_of_the_file(path: Path, session: str, rng: random.Random, count: int) -> None:
-    """Flip one bit anywhere in the file, again and again, and see that nothing false comes out silently."""
-    whole = path.read_bytes()
-    copy = path.with_name("flipped")
-    for _ in range(count):
-        place = rng.randrange(len(whole))
-        copy.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << rng.randrange(8)]) + whole[place + 1 :])
-        try:
-            with closing(RecordReader.open(copy)) as reader:
-                (row,) = reader.list_sessions() or [reader.get_session(session)]
-                read = {number: bits(line) for number, line in reader.lines(session, on_damage=lambda _: None)}
-                events = [event for event in reader.events(session) if not event.damaged]
-                found = reader.verify(session)
-        except RecordError:
-            continue  # it says so
-        assert all(TRUTH[number] == line for number, line in read.items()), place
-        assert all(event.details == {"i": event.number} for event in events), place
-        whole_still = len(read) == LINES and len(events) == 10 and (row.session_id, row.damaged) == (session, False)
-        assert whole_still or found.damaged or found.problems, f"a silent loss at byte {place}"
-
-
-def test_one_flipped_bit_anywhere_in_the_file_is_harmless_or_seen(stored: tuple[Path, str]) -> None:
-    flips_of_the_file(*stored, random.Random(4), 60)
-
-
-@pytest.mark.long
-def test_ten_thousand_flipped_bits_of_the_file_are_harmless_or_seen(stored: tuple[Path, str]) -> None:
-    flips_of_the_file(*stored, random.Random(5), 10_000)

@@ -91,3 +91,15 @@ test("a file's account and a tally of a shape unknown here are told too", () => 
   assert.deepEqual(other.rows.map(([name, count]) => [name, count]), [["Robot, stops", 2], ["Robot, moves, late", 3]]);
   assert.deepEqual(accounts(null), []);
 });
+
+test("every pass is told as one balance, and boots are named only where there are several", () => {
+  const lines = { sent: 12, stored: 9, whole: 8, partial: 1, under_way: 1, duplicates: 0, lost: { record_busy: 2 } };
+  const pass = (boot, index) => ({ device_id: "S1", boot_id: boot, pass_index: index, lines, chunks: null });
+  const [one] = accounts({ passes: [pass(7, 3)] });
+  assert.deepEqual([one.title, one.total], ["Pass 3 of S1", 12]);
+  assert.equal(one.rows.reduce((sum, [, count]) => sum + count, 0), one.total);
+  assert.ok(one.rows.some(([name, count, kind]) => name === "Lost: the disk failed" && count === 2 && kind === "lost"));
+  const many = accounts({ passes: Array.from({ length: 40 }, (_, index) => pass(7 + (index % 2), index)) });
+  assert.equal(many.at(-1).title, "Pass 39 of S1, boot 8");
+  assert.ok(many.length <= 12);
+});

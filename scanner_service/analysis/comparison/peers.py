@@ -1,0 +1,56 @@
+"""What ours is compared with: a plain principal component analysis, and Open3D where it is installed; nothing of ours.
+
+Both are tried at many settings, of which the best one counts: they are told what nobody knows in practice.
+"""
+
+import importlib
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from drivers.scanline import Float64Array
+from scanner_service.analysis.comparison.running import Contestant, Estimator
+
+COUNTS = (8, 10, 15, 20, 25, 30, 40, 60, 80, 120, 200, 320, 500)
+_AT_ONCE = 2_000_000
+
+
+def plain_pca(points_mm: Float64Array, count: int) -> Float64Array:
+    """Normals (n, 3) from the covariance of the `count` nearest points, by numpy alone."""
+    tree = cKDTree(points_mm)
+    normals = np.empty_like(points_mm)
+    step = max(1, _AT_ONCE // count)
+    for first in range(0, len(points_mm), step):
+        at = points_mm[first : first + step]
+        rows = np.asarray(tree.query(at, k=np.arange(1, count + 1))[1])
+        near = points_mm[rows]
+        near -= near.mean(axis=1, keepdims=True)
+        normals[first : first + step] = np.linalg.eigh(np.swapaxes(near, 1, 2) @ near)[1][:, :, 0]
+    return normals
+
+
+def peers(points: int) -> tuple[list[Contestant], list[str]]:
+    """The contestants from outside for clouds of at least so many points, and notes on who is absent."""
+    counts = [count for count in COUNTS if count <= max(points // 4, COUNTS[0])]
+
+    def plain(count: int) -> Estimator:
+        return lambda cloud: plain_pca(cloud, min(count, len(cloud)))
+
+    found = [Contestant("plain_pca_best", {f"k={count}": plain(count) for count in counts})]
+    try:
+        open3d = importlib.import_module("open3d")
+    except ImportError:
+        return found, ["Open3D is not installed, so it is left out: install scanner-service[bench] to have it"]
+
+    def theirs(count: int) -> Estimator:
+        return lambda cloud: _open3d_normals(open3d, cloud, count)
+
+    found.append(Contestant("open3d_best", {f"k={count}": theirs(count) for count in counts}))
+    return found, []
+
+
+def _open3d_normals(open3d: Any, points_mm: Float64Array, count: int) -> Float64Array:
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points_mm.copy()))
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(count))
+    return np.asarray(cloud.normals).copy()

@@ -1,0 +1,128 @@
+"""Planes through neighbourhoods, plain or weighted by distance; knows not how the neighbourhoods were chosen."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from drivers.scanline import Float64Array
+from scanner_service.analysis.normals.field import (
+    MIN_NEIGHBOURS,
+    Int64Array,
+    NormalField,
+    NormalReason,
+    Tell,
+    tell_nobody,
+)
+from scanner_service.analysis.normals.neighbourhoods import Neighbourhoods
+from scanner_service.analysis.plane import smallest_axis
+
+MIN_SPREAD = 1e-9
+"""The second moment must be at least this share of the first; below, the points lie on a line."""
+
+
+def fit_all(
+    method: str,
+    points_mm: Float64Array,
+    neighbourhoods: Iterable[Neighbourhoods],
+    *,
+    max_error_rad: float,
+    width_share: float = 0.0,
+    notes: tuple[str, ...] = (),
+    extra: Mapping[str, Float64Array] | None = None,
+    tell: Tell = tell_nobody,
+) -> NormalField:
+    """Planes of least squared orthogonal distance through every neighbourhood (Ahn 2004, Eqs. 6.5 to 6.10).
+
+    With `width_share` > 0 a point at distance d weighs exp(-d²/h²), h being that share of the neighbourhood's radius
+    (Pauly et al. 2003). Together the neighbourhoods have each of the points (n, 3) once.
+
+    The predicted error is the asymptotic one of a principal axis, √(λ2 λ3) / ((λ2 - λ3) √(N - 3)) (Anderson 1963),
+    N being the effective number of points, (Σw)² / Σw²; it tends to σ/√λ2 on a flat patch.
+    """
+    n = len(points_mm)
+    normals = np.full((n, 3), np.nan)
+    reason = np.zeros(n, dtype=np.uint8)
+    error = np.full(n, np.nan)
+    radius = np.full(n, np.nan)
+    counts = np.zeros(n, dtype=np.int64)
+    for some in neighbourhoods:
+        axes, moments, effective = plane_fits(points_mm, some, width_share * some.radius_mm)
+        count = np.diff(some.starts)
+        normals[some.at], reason[some.at], error[some.at] = judge_planes(axes, moments, effective, count, max_error_rad)
+        radius[some.at], counts[some.at] = some.radius_mm, count
+        tell((int(some.at[-1]) + 1) / n)
+    return NormalField(method, normals, reason, error, radius, counts, notes, extra or {})
+
+
+def judge_planes(
+    axes: Float64Array, moments: Float64Array, effective: Float64Array, count: Int64Array, max_error_rad: float
+) -> tuple[Float64Array, npt.NDArray[np.uint8], Float64Array]:
+    """Normals (m, 3), NaN where none is given, the reason (m,) and the predicted error (m,) of fitted planes."""
+    large, middle, small = moments[:, 0], moments[:, 1], moments[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.sqrt(middle * small) / (middle - small) / np.sqrt(effective - 3.0)
+    is_flat = (small <= 1e-14 * middle) & (middle > 0.0) & (effective > 3.0)
+    error = np.where(is_flat, 0.0, error)
+    reason = np.full(len(count), NormalReason.GIVEN, dtype=np.uint8)
+    reason[~(error <= max_error_rad)] = NormalReason.UNCERTAIN if max_error_rad < np.inf else NormalReason.GIVEN
+    reason[~(middle > MIN_SPREAD * large)] = NormalReason.UNDETERMINED
+    reason[count < MIN_NEIGHBOURS] = NormalReason.TOO_FEW
+    normals = np.where((reason == NormalReason.GIVEN)[:, None], axes, np.nan)
+    return normals, reason, np.where(np.isfinite(error), error, np.nan)
+
+
+def plane_fits(
+    points_mm: Float64Array, some: Neighbourhoods, width_mm: Float64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Axis of the smallest moment (m, 3), moments in mm² (m, 3), largest first, and effective counts (m,).
+
+    `width_mm` (m,) is h of the Gaussian weight; 0 weighs all alike.
+    """
+    m = len(some.at)
+    axes, moments, effective = np.empty((m, 3)), np.empty((m, 3)), np.empty(m)
+    with np.errstate(divide="ignore"):
+        per_square = np.where(width_mm > 0.0, 1.0 / (width_mm * width_mm), 0.0)
+    _fit(points_mm, some.at, some.starts, some.rows, per_square, axes, moments, effective)
+    return axes, moments, effective
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit(
+    points: Float64Array,
+    at: Int64Array,
+    starts: Int64Array,
+    rows: Int64Array,
+    per_square: Float64Array,
+    axes: Float64Array,
+    moments: Float64Array,
+    effective: Float64Array,
+) -> None:
+    """Moments of offsets from the point itself, centred on their weighted mean; nothing is checked."""
+    for i in range(len(at)):
+        px, py, pz = points[at[i], 0], points[at[i], 1], points[at[i], 2]
+        w = w2 = x = y = z = xx = xy = xz = yy = yz = zz = 0.0
+        for k in range(starts[i], starts[i + 1]):
+            dx, dy, dz = points[rows[k], 0] - px, points[rows[k], 1] - py, points[rows[k], 2] - pz
+            g = np.exp(-(dx * dx + dy * dy + dz * dz) * per_square[i]) if per_square[i] > 0.0 else 1.0
+            w += g
+            w2 += g * g
+            x, y, z = x + g * dx, y + g * dy, z + g * dz
+            xx, xy, xz = xx + g * dx * dx, xy + g * dx * dy, xz + g * dx * dz
+            yy, yz, zz = yy + g * dy * dy, yz + g * dy * dz, zz + g * dz * dz
+        if w == 0.0:
+            axes[i, :], moments[i, :], effective[i] = 0.0, 0.0, 0.0
+            continue
+        per = 1.0 / w
+        nx, ny, nz, a, b, c = smallest_axis(
+            xx - x * x * per,
+            xy - x * y * per,
+            xz - x * z * per,
+            yy - y * y * per,
+            yz - y * z * per,
+            zz - z * z * per,
+        )
+        axes[i, 0], axes[i, 1], axes[i, 2] = nx, ny, nz
+        moments[i, 0], moments[i, 1], moments[i, 2] = a, b, c
+        effective[i] = w * w / w2

@@ -1,0 +1,30 @@
+"""Planes of least orthogonal distance through a number of neighbours: the chapter's method, and the default."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from drivers.scanline import Float64Array
+from scanner_service.analysis.normals.choosing_count import choose_count
+from scanner_service.analysis.normals.field import NormalField, NormalOptions, Tell, tell_nobody
+from scanner_service.analysis.normals.fitting import fit_all
+from scanner_service.analysis.normals.neighbourhoods import by_number, by_radius
+
+NAME = "orthogonal_distance"
+
+
+def orthogonal_distance(points_mm: Float64Array, options: NormalOptions, tell: Tell = tell_nobody) -> NormalField:
+    """Normals of (n, 3) by orthogonal distance fits (Ahn 2004), the axis of the smallest central moment.
+
+    The neighbourhood is a stated radius or number of points; with neither the number is chosen for the cloud.
+    """
+    tree = cKDTree(points_mm)
+    if options.radius_mm is not None:
+        pieces = by_radius(tree, points_mm, np.full(len(points_mm), options.radius_mm))
+        return fit_all(NAME, points_mm, pieces, max_error_rad=options.max_error_rad, tell=tell)
+    notes: tuple[str, ...] = ()
+    count = options.neighbours
+    if count is None:
+        count = choose_count(points_mm)
+        notes = (f"{count} neighbours, chosen: two halves of the cloud agree best on normals with so many",)
+    pieces = by_number(tree, points_mm, np.arange(len(points_mm)), count)
+    return fit_all(NAME, points_mm, pieces, max_error_rad=options.max_error_rad, tell=tell, notes=notes)

@@ -1,0 +1,224 @@
+"""`scanner sessions`: what a running service holds: list, show with the ledger, open, pause, resume, stop, delete."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import httpx
+import typer
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from scanner_service.api.keys import read_local_key
+from scanner_service.commands.serve import DEFAULT_DATA, Data
+from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json
+
+sessions_app = typer.Typer(
+    help="The sessions of a running service: list, show with the ledger of losses, open, pause, resume, stop, delete.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+Url = Annotated[str, typer.Option(help="Where the service listens.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")]
+SessionId = Annotated[str, typer.Argument(help="The session's id, as `list` shows it.")]
+DEFAULT_URL = "http://127.0.0.1:8765"
+_POLL_S = 0.1
+
+
+@contextmanager
+def running_service(data: Path, url: str) -> Iterator[httpx.Client]:
+    """A client of the running service, with this machine's own key."""
+    key = read_local_key(data)
+    if key is None:
+        fail(f"there is no key in {data}: start `scanner serve` first, or name its folder with --data")
+    with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {key}"}, timeout=120.0) as client:
+        try:
+            client.get("/healthz")
+        except httpx.HTTPError as error:
+            fail(f"no service answers at {url} ({error}): start it with `scanner serve`, or say --url")
+        yield client
+
+
+def ask(client: httpx.Client, method: str, path: str, **said: Any) -> Any:
+    """The answer of the service; what it refuses is told in its own words."""
+    answer = client.request(method, path, **said)
+    if answer.is_error:
+        fail(f"the service refused: {answer.json().get('detail', answer.status_code)}")
+    return answer.json() if answer.content else None
+
+
+def _path(session_id: str, rest: str = "") -> str:
+    if not session_id.isalnum():
+        fail(f"{session_id!r} is no session id; `scanner sessions list` shows them")
+    return f"/api/v1/sessions/{session_id}{rest}"
+
+
+@sessions_app.command("list")
+def list_command(
+    data: Data = DEFAULT_DATA,
+    url: Url = DEFAULT_URL,
+    limit: Annotated[int, typer.Option(min=1, max=1000, help="At most so many, the newest first.")] = 20,
+    as_json: AsJson = False,
+) -> None:
+    """The sessions, newest first."""
+    with plain_errors(), running_service(data, url) as client:
+        found = ask(client, "GET", "/api/v1/sessions", params={"limit": limit})["sessions"]
+        if as_json:
+            show_json(found)
+            return
+        table = Table()
+        for name, justify in (("id", "left"), ("name", "left"), ("state", "left"), ("created", "left")):
+            table.add_column(name, justify=justify)  # type: ignore[arg-type]
+        for name in ("lines", "points"):
+            table.add_column(name, justify="right")
+        for row in found:
+            when = row["created"][:16].replace("T", " ")
+            table.add_row(row["id"], row["name"], row["state"], when, f"{row['lines']:,}", f"{row['points']:,}")
+        console.print(table)
+
+
+@sessions_app.command("show")
+def show_command(
+    session_id: SessionId, data: Data = DEFAULT_DATA, url: Url = DEFAULT_URL, as_json: AsJson = False
+) -> None:
+    """What a session is doing, and what became of every line of it."""
+    with plain_errors(), running_service(data, url) as client:
+        _open(client, session_id, quiet=as_json)
+        status = ask(client, "GET", _path(session_id))
+        if as_json:
+            show_json(status)
+            return
+        console.print(
+            f"{status['name']}  {status['state']}  {status['lines']:,} lines  {status['points']:,} points  "
+            f"{status['points_per_s']:,.0f} points/s",
+            highlight=False,
+        )
+        for text in (status["message"], status["notes"]):
+            if text:
+                console.print(text, highlight=False)
+        console.print(ledger_table(status["losses"]["passes"]))
+
+
+def ledger_table(passes: list[dict[str, Any]]) -> Table:
+    """The ledger as people read it: a row a pass, each of which adds up; reasons below each other."""
+    table = Table(title="Ledger, scanlines: sent = stored + under way + lost", title_justify="left")
+    table.add_column("pass", no_wrap=True)
+    for name in ("sent", "stored", "partial", "under way", "lost", "chunks lost"):
+        table.add_column(name, justify="right")
+    boots = {(account["device_id"], account["boot_id"]) for account in passes}
+    devices = {device for device, _ in boots}
+    for account in passes:
+        lines, chunks = account["lines"], account["chunks"]
+        name = f"{account['device_id']}  {account['pass_index']}"
+        if len(boots) > len(devices):
+            name += f"\n  boot {account['boot_id']}"
+        lost_chunks = "–" if chunks is None else _with_reasons(chunks["lost"], f" of {chunks['sent']:,}")
+        counts = (f"{lines[kind]:,}" for kind in ("sent", "stored", "partial", "under_way"))
+        table.add_row(name, *counts, _with_reasons(lines["lost"]), lost_chunks)
+    return table
+
+
+def _with_reasons(lost: dict[str, int], rest: str = "") -> str:
+    reasons = "".join(f"\n{reason.replace('_', ' ')} {count:,}" for reason, count in lost.items())
+    return f"{sum(lost.values()):,}{rest}{reasons}"
+
+
+@sessions_app.command("open")
+def open_command(
+    session_id: SessionId, data: Data = DEFAULT_DATA, url: Url = DEFAULT_URL, as_json: AsJson = False
+) -> None:
+    """Reopen a session: its live map is built again from the record, with a progress bar."""
+    with plain_errors(), running_service(data, url) as client:
+        _open(client, session_id, quiet=as_json)
+        status = ask(client, "GET", _path(session_id))
+        if as_json:
+            show_json(status)
+        else:
+            console.print(f"open: {status['lines']:,} lines, {status['points']:,} points", highlight=False)
+
+
+def _open(client: httpx.Client, session_id: str, quiet: bool) -> None:
+    """Have the session opened, and show how far that is."""
+    told = ask(client, "POST", _path(session_id, "/open"))
+    bar = Progress(
+        TextColumn("opening"),
+        BarColumn(bar_width=24),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TextColumn("{task.fields[facts]}"),
+        console=errors,
+        disable=quiet,
+        transient=True,
+    )
+    with bar:
+        task = bar.add_task("opening", total=1.0, facts="")
+        while not told["is_open"]:
+            if told["failure"]:
+                fail(told["failure"])
+            if told["progress"] is not None:
+                facts = f"{told['lines']:,} of {told['of']:,} lines"
+                bar.update(task, completed=told["progress"], facts=facts)
+            time.sleep(_POLL_S)
+            told = ask(client, "GET", _path(session_id, "/open"))
+
+
+def _telling(verb: str, told: str) -> None:
+    """A command that asks for one thing and says what state the session is in then."""
+
+    def command(
+        session_id: SessionId, data: Data = DEFAULT_DATA, url: Url = DEFAULT_URL, as_json: AsJson = False
+    ) -> None:
+        with plain_errors(), running_service(data, url) as client:
+            status = ask(client, "POST", _path(session_id, f"/{verb}"))
+            if as_json:
+                show_json(status)
+            else:
+                message = f": {status['message']}" if status["message"] else ""
+                console.print(f"{status['state']}{message}", highlight=False)
+
+    command.__doc__ = told
+    sessions_app.command(verb)(command)
+
+
+_telling("start", "Begin to scan: the laser of a device is switched on.")
+_telling("pause", "Hold a scan: stage and laser stop.")
+_telling("resume", "Go on behind the last line: the laser is switched on.")
+_telling("stop", "End a scan and judge it.")
+
+
+@sessions_app.command("note")
+def note_command(
+    session_id: SessionId,
+    text: Annotated[str, typer.Argument(help="What is to be said of the session; replaces what was said before.")],
+    data: Data = DEFAULT_DATA,
+    url: Url = DEFAULT_URL,
+    as_json: AsJson = False,
+) -> None:
+    """Keep notes with a session."""
+    with plain_errors(), running_service(data, url) as client:
+        row = ask(client, "PATCH", _path(session_id), json={"notes": text})
+        if as_json:
+            show_json(row)
+        else:
+            console.print(f"noted on {row['name']}", highlight=False)
+
+
+@sessions_app.command("delete")
+def delete_command(
+    session_id: SessionId,
+    data: Data = DEFAULT_DATA,
+    url: Url = DEFAULT_URL,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+) -> None:
+    """Delete a session with everything stored of it; asks first."""
+    with plain_errors(), running_service(data, url) as client:
+        answer = client.delete(_path(session_id))
+        if answer.status_code != httpx.codes.CONFLICT:
+            fail(f"the service refused: {answer.json().get('detail', answer.status_code)}")
+        if not yes:
+            errors.print(answer.json()["detail"].partition(": say so")[0], highlight=False, soft_wrap=True)
+            if not typer.confirm("Delete it?", err=True):
+                fail("nothing was deleted")
+        ask(client, "DELETE", _path(session_id), params={"confirm": session_id})
+        console.print("deleted", highlight=False)

@@ -1,0 +1,139 @@
+"""What the report of a session says: gathers it from the rebuilt session; draws and lays out nothing."""
+
+import math
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from scanner_service.analysis.passes import PassKey
+from scanner_service.sessions.fingerprint import verdict_sha256
+from scanner_service.sessions.results import Results, summarise
+from scanner_service.sessions.stored import Stage, StoredSession
+from scanner_service.storage.exports.report_content import (
+    FateRow,
+    PassRow,
+    ReportContent,
+    Verdictful,
+    flat_rows,
+    shown,
+)
+
+
+def report_of(stored: StoredSession, now: datetime) -> ReportContent:
+    """The content of the report of a session that was read with its stages."""
+    results = stored.results
+    required = results.coverage.required_per_mm2
+    required = required[np.isfinite(required)]
+    summary = summarise(results, stored.losses, math.nan, stored.about.version)
+    regions = results.report.regions
+    area = sum(region.area_mm2 for region in regions)
+    share = results.coverage.share
+    return ReportContent(
+        title=stored.row.name or stored.row.session_id,
+        session_id=stored.row.session_id,
+        state=stored.row.state,
+        created=stored.row.created_utc[:16].replace("T", " ") + " UTC",
+        written=now.isoformat(timespec="seconds").replace("+00:00", "Z"),
+        software=stored.about.software,
+        raw_sha256=stored.raw_sha256,
+        verdict_sha256=verdict_sha256(results),
+        final=_verdictful(results),
+        first=None if stored.first is None else _verdictful(stored.first),
+        passes=tuple(_pass_row(number, stage) for number, stage in enumerate(stored.stages, start=1)),
+        pass_ends=stored.pass_ends,
+        fates=fates_of(stored.first, results) if stored.first is not None else (),
+        required_per_mm2=float(np.median(required)) if len(required) else math.nan,
+        headlines=(
+            ("observed coverage", "unknown" if math.isnan(share) else f"{100 * share:.1f} %"),
+            ("points", shown(summary["points"])),
+            ("scanlines", shown(summary["scanlines"])),
+            ("regions to scan again", shown(len(regions))),
+            ("their area", f"{area:,.0f} mm²"),
+        ),
+        facts=_facts(summary),
+        losses=_losses(stored.losses),
+        settings=tuple(_setting(name, value) for name, value in stored.row.settings.items()),
+        damaged=stored.damaged,
+    )
+
+
+def fates_of(first: Results, last: Results) -> tuple[FateRow, ...]:
+    """What became of each region of the first pass. Rows of a map stay what they are, so its points are found again."""
+    return tuple(
+        FateRow(
+            region.number,
+            region.reason.label.replace("_", " "),
+            region.area_mm2,
+            float(last.report.rescan[region.point_rows].mean()) if len(region.point_rows) else 0.0,
+        )
+        for region in first.report.regions
+    )
+
+
+def _verdictful(results: Results) -> Verdictful:
+    return Verdictful(results.snapshot, results.report, results.coverage)
+
+
+def _pass_row(number: int, stage: Stage) -> PassRow:
+    return PassRow(
+        name=", ".join(_pass_name(key) for key in stage.passes) or f"stage {number}",
+        lines=stage.lines,
+        points=stage.points,
+        coverage=stage.coverage,
+        touched_mm2=stage.touched_mm2,
+        gap_mm2=stage.gap_mm2,
+        regions=stage.regions,
+        region_mm2=stage.region_mm2,
+    )
+
+
+def _pass_name(key: PassKey) -> str:
+    return f"{key[0]} pass {key[2]}"
+
+
+def _facts(summary: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """The summary's own figures, spreads as smallest – median – largest."""
+    rows = []
+    for name, unit in (("line_spacing_mm", "mm"), ("point_spacing_mm", "mm"), ("radius_mm", "mm"),
+                       ("density_per_mm2", "points/mm²")):  # fmt: skip
+        spread = summary[name]
+        values = " – ".join(f"{spread[part]:.4g}" for part in ("min", "median", "max"))
+        label = name.removesuffix("_mm").removesuffix("_per_mm2").replace("_", " ")
+        rows.append((f"{label}, smallest – median – largest", f"{values} {unit}"))
+    rows.append(("points with a reliable normal", f"{100 * summary['reliable_share']:.1f} %"))
+    rows.append(("points that are settled", f"{100 * summary['settled_share']:.1f} %"))
+    rows.append(("isolated points", shown(summary["isolated"])))
+    rows += [(f"radius by {rule.replace('_', ' ')}", shown(count)) for rule, count in summary["radius_rules"].items()]
+    rows += [
+        (f"no normal: {reason.replace('_', ' ')}", shown(count))
+        for reason, count in summary["unreliable"].items()
+        if count
+    ]
+    return tuple(rows)
+
+
+def _losses(losses: Mapping[str, Any]) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:
+    names = {"lines": "Lines, as they came in", "points": "Places in the lines", "device": "Scanner and wire"}
+    groups = []
+    for key, value in losses.items():
+        if isinstance(value, Mapping):
+            rows = flat_rows({name: value[name] for name in sorted(value, key=_in_order)})
+            groups.append((names.get(key, key.replace("_", " ")), tuple(rows)))
+    return tuple(groups)
+
+
+def _in_order(name: str) -> tuple[int, str]:
+    """Accounts are read from what came in to what is missing."""
+    order = ("received", "places", "sent", "stored", "counted", "pending", "duplicates", "conflicts")
+    return (order.index(name) if name in order else len(order), name)
+
+
+def _setting(name: str, value: Any) -> tuple[str, str]:
+    """A setting with its unit behind the value; angles in degrees, as users give them."""
+    for ending, unit, factor in (("_per_mm2", "points/mm²", 1.0), ("_mm", "mm", 1.0), ("_rad", "°", 180 / math.pi)):
+        if name.endswith(ending):
+            told = "by the rule" if value is None else f"{factor * value:.6g} {unit}"
+            return name.removesuffix(ending).replace("_", " "), told
+    return name.replace("_", " "), shown(value)

@@ -1,0 +1,118 @@
+"""A rig as a session's source: its stage is homed if that was asked, one pass is driven, its lines go to the sink."""
+
+import contextlib
+import logging
+import threading
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+
+from drivers.errors import DriverError
+from drivers.protocols.scanner_events import PassEnded
+from drivers.protocols.stage_events import PositionLost, StageDisconnected, StageReconnected
+from drivers.rig_limits import PassOrder
+from drivers.running_rig import RigEvent, RigPassEnded, RunningRig
+from drivers.scanline import DeviceInfo, Float64Array, Scanline, SensorGeometry
+from drivers.stages.face import DrivenStage
+from scanner_service.sessions.sources import Sink, tell_scanner_event
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Preparation:
+    """What comes before the pass: homing, or the user's word on where the stage is (`at_mm`), or neither."""
+
+    home: bool = False
+    at_mm: float | None = None
+
+
+class RigSource:
+    """One pass of a rig that is entered already."""
+
+    def __init__(self, rig: RunningRig, order: PassOrder, info: DeviceInfo, preparation: Preparation) -> None:
+        self.geometry: SensorGeometry | None = rig.limits.geometry or info.geometry
+        self.towards_sensor: Float64Array | None = rig.pose_at(order.start_mm).rotate(np.array([0.0, 0.0, 1.0]))
+        self.info = info
+        self._rig = rig
+        self._order = order
+        self._preparation = preparation
+        self._position_mm = order.start_mm
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self, sink: Sink) -> None:
+        """Begin: in a thread of its own the stage is prepared and the pass is driven."""
+        self._thread = threading.Thread(target=self._pump, args=(sink,), name="rig-source", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the stage first, then the scanner, and let go of both."""
+        self._stopping.set()
+        self._rig.stop()
+        if self._thread is None:  # never started: nobody else lets go of the ports
+            self._rig.exit()
+        elif self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def tally(self) -> dict[str, Any] | None:
+        """The scanner's accounts, and under `rig` what became of its profiles."""
+        return self._rig.tally().to_dict() | {"rig": self._rig.report().to_dict()}
+
+    def progress(self) -> float | None:
+        """Share of the travel that lines have been placed on."""
+        span_mm = self._order.end_mm - self._order.start_mm
+        return min(1.0, max(0.0, (self._position_mm - self._order.start_mm) / span_mm))
+
+    def _pump(self, sink: Sink) -> None:
+        failure: str | None = None
+        try:
+            self._prepare()
+            if not self._stopping.is_set():
+                self._rig.start(self._order)
+                failure = self._follow(sink)
+        except DriverError as error:
+            failure = None if self._stopping.is_set() else str(error)
+        except Exception as error:  # noqa: BLE001 - the thread's loop: everything stops and the session is told
+            _LOG.exception("driving the rig stopped")
+            failure = f"driving the rig stopped by an internal fault: {error}"
+        with contextlib.suppress(DriverError):
+            self._rig.exit()
+        sink.ended(failure)
+
+    def _prepare(self) -> None:
+        if not self._rig.is_driven:
+            return
+        stage = cast(DrivenStage, self._rig.stage)
+        if self._preparation.home:
+            stage.home()
+        elif self._preparation.at_mm is not None:
+            stage.set_position(self._preparation.at_mm)
+
+    def _follow(self, sink: Sink) -> str | None:
+        """Pass everything on until the pass is over; return why it failed, if it did."""
+        while True:
+            for event in self._rig.events(0.1):
+                if isinstance(event, RigPassEnded):
+                    sink.note("pass_ended", {"reason": event.reason, **event.report.to_dict()})
+                    return event.failure
+                self._pass_on(event, sink)
+
+    def _pass_on(self, event: RigEvent, sink: Sink) -> None:
+        match event:
+            case Scanline():
+                self._position_mm = event.position_mm
+                sink.line(event)
+            case StageDisconnected(reason=reason):
+                sink.note("interrupted", {"reason": reason})
+            case StageReconnected(gap_s=gap_s, position_kept=position_kept):
+                sink.note("reconnected", {"gap_s": gap_s, "position_kept": position_kept})
+                if position_kept:
+                    sink.note("resumed", {})
+            case PositionLost(reason=reason):
+                sink.note("position_lost", {"reason": reason})
+            case RigPassEnded() | PassEnded():
+                pass  # the rig tells the end of its pass itself
+            case _:
+                tell_scanner_event(event, sink)

@@ -1,0 +1,263 @@
+"""What a person does with a session: pauses, resumes, reopens, annotates, deletes it; and what the laser does then."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+import websockets.exceptions
+import websockets.sync.client
+from typer.testing import CliRunner
+
+from scanner_service.cli import app
+from tests.end_to_end.running import wait_for
+from tests.end_to_end.test_live_scan import device, live_client, read_ply
+
+
+def account_of(status):
+    """Lines sent, stored and lost over all passes; each pass balances."""
+    sent = stored = lost = 0
+    for told in status["losses"]["passes"]:
+        lines, chunks = told["lines"], told["chunks"]
+        assert lines["sent"] == lines["stored"] + lines["under_way"] + sum(lines["lost"].values()), told
+        assert lines["stored"] == lines["whole"] + lines["partial"]
+        assert chunks is None or chunks["sent"] == chunks["stored"] + sum(chunks["lost"].values()), told
+        sent, stored, lost = sent + lines["sent"], stored + lines["stored"], lost + sum(lines["lost"].values())
+    return sent, stored, lost
+
+
+def act(service, session_id, verb):
+    answer = service.client.post(f"/api/v1/sessions/{session_id}/{verb}")
+    assert answer.status_code == 200, answer.text
+    return answer.json()
+
+
+def test_a_paused_scan_goes_on_behind_its_last_line_as_another_pass(running):
+    service, simulator = running.service(), running.simulator("plate")
+    session_id = service.create(**device(simulator))
+    service.start(session_id)
+    wait_for(lambda: service.status(session_id)["lines"] > 10, "some lines")
+    paused = act(service, session_id, "pause")
+    assert (paused["state"], paused["held"]) == ("paused", True)
+    assert service.client.post(f"/api/v1/sessions/{session_id}/pause").status_code == 409
+    wait_for(lambda: account_of(service.status(session_id))[0] == service.status(session_id)["lines"], "all lines")
+    before = service.status(session_id)["lines"]
+    time.sleep(0.5)
+    assert service.status(session_id)["lines"] == before
+    act(service, session_id, "resume")
+    status = service.wait_for_state(session_id, "stopped")
+    passes = status["losses"]["passes"]
+    assert [told["lines"]["sent"] for told in passes] == [before, 81 - before]
+    assert account_of(status) == (81, 81, 0)
+    lines = service.client.get(f"/api/v1/sessions/{session_id}/scanlines", params={"limit": 200}).json()["scanlines"]
+    np.testing.assert_allclose([line["position_mm"] for line in lines], 2.0 + 0.25 * np.arange(81), atol=1e-9)
+
+
+def test_after_an_interruption_longer_than_the_dead_man_the_laser_stays_off_until_somebody_says_so(running, tmp_path):
+    service, link = running.service(), tmp_path / "port"
+    simulator = running.simulator("plate", "--link", link)
+    session_id = service.create(**device(simulator, port=str(link)))
+    service.start(session_id)
+    wait_for(lambda: service.status(session_id)["lines"] > 10, "some lines")
+    simulator.tell("unplug")
+    service.wait_for_state(session_id, "paused")
+    assert service.client.post(f"/api/v1/sessions/{session_id}/resume").status_code == 409  # there is no scanner
+    time.sleep(1.5)
+    simulator.tell("replug")
+    wait_for(lambda: service.status(session_id)["held"], "the scanner to be back and held")
+    held = service.status(session_id)
+    assert held["state"] == "paused"
+    assert "laser is off" in held["message"]
+    time.sleep(0.7)
+    assert service.status(session_id)["lines"] == held["lines"]
+    resumed = act(service, session_id, "resume")
+    assert resumed["message"] is None
+    status = service.wait_for_state(session_id, "stopped")
+    sent, stored, lost = account_of(status)
+    assert (sent, lost) == (stored + lost, status["losses"]["device"]["lines"]["lost"].get("disconnected", 0))
+    assert len(status["losses"]["passes"]) == 2
+    kinds = [event["kind"] for event in service.client.get(f"/api/v1/sessions/{session_id}/events").json()["events"]]
+    assert [kind for kind in kinds if kind in ("interrupted", "held", "resumed")] == ["interrupted", "held", "resumed"]
+
+
+def test_a_killed_scan_is_reopened_with_its_ledger_its_notes_and_the_same_verdict(running):
+    service, simulator = running.service(), running.simulator("step")
+    session_id = service.create(**device(simulator, end_mm=simulator.ready["travel_mm"][1]))
+    service.client.patch(f"/api/v1/sessions/{session_id}", json={"notes": "fixture 7", "name": "step"})
+    service.start(session_id)
+    over = service.wait_for_state(session_id, "stopped")
+    regions = service.client.get(f"/api/v1/sessions/{session_id}/regions").json()["regions"]
+    other = running.simulator("plate")
+    killed_id = service.create(**device(other))
+    service.start(killed_id)
+    wait_for(lambda: (service.status(killed_id)["losses"]["passes"] or [{"lines": {"stored": 0}}])[0]["lines"]["stored"]
+             > 20, "some lines")  # fmt: skip
+    time.sleep(1.5)  # the ledger is kept about every second
+    service.kill()
+
+    service = running.service()
+    told = service.client.post(f"/api/v1/sessions/{session_id}/open")
+    assert told.status_code == 202
+    wait_for(
+        lambda: service.client.get(f"/api/v1/sessions/{session_id}/open").json()["is_open"], "the session to be open"
+    )
+    again = service.status(session_id)
+    assert (again["notes"], again["name"], again["lines"]) == ("fixture 7", "step", over["lines"])
+    assert again["losses"]["passes"] == over["losses"]["passes"]
+    assert again["losses"]["device"] == over["losses"]["device"]
+    assert again["points_per_s"] == pytest.approx(over["points_per_s"], rel=0.2)
+    assert again["calibration"]["scanner"]["device_id"] == "SIM-0001"
+    assert service.client.get(f"/api/v1/sessions/{session_id}/regions").json()["regions"] == regions
+    killed = service.status(killed_id)
+    sent, stored, lost = account_of(killed)
+    assert stored == killed["lines"] > 20
+    assert sent == stored + lost
+    assert killed["points_per_s"] > 0
+    assert service.client.post(f"/api/v1/sessions/{'0' * 14}/open").status_code == 404
+
+
+def test_a_creation_that_is_sent_again_makes_no_second_session_also_after_a_restart(running):
+    service = running.service()
+    asked = {"name": "once", "source": {"kind": "push"}}
+    key = {"Idempotency-Key": "7f3a"}
+    first = service.client.post("/api/v1/sessions", json=asked, headers=key)
+    again = service.client.post("/api/v1/sessions", json=asked, headers=key)
+    assert (first.status_code, again.status_code) == (201, 201)
+    assert first.json()["id"] == again.json()["id"]
+    other = service.client.post("/api/v1/sessions", json=asked | {"name": "other"}, headers=key)
+    assert (other.status_code, other.json()["type"]) == (422, "/problems/idempotency-key-reused")
+    service.kill()
+    service = running.service()
+    assert service.client.post("/api/v1/sessions", json=asked, headers=key).json()["id"] == first.json()["id"]
+    assert len(service.client.get("/api/v1/sessions").json()["sessions"]) == 1
+    assert (
+        service.client.post("/api/v1/sessions", json=asked, headers={"Idempotency-Key": "x" * 256}).status_code == 422
+    )
+
+
+def test_the_command_line_does_what_the_service_does(running):
+    service, simulator = running.service(), running.simulator("plate")
+    session_id = service.create(**device(simulator))
+    runner, where = CliRunner(), ["--data", str(service.data), "--url", service.url]
+
+    def run(*arguments, **said):
+        done = runner.invoke(app, ["sessions", *arguments, *where], **said)
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    run("start", session_id)
+    wait_for(lambda: service.status(session_id)["lines"] > 5, "some lines")
+    assert run("pause", session_id).startswith("paused")
+    assert run("resume", session_id).startswith("scanning")
+    service.wait_for_state(session_id, "stopped")
+    run("note", session_id, "a scratch at the edge")
+    assert session_id in run("list")
+    shown = json.loads(run("show", session_id, "--json"))
+    assert (shown["notes"], shown["lines"]) == ("a scratch at the edge", 81)
+    assert "SIM-0001" in run("show", session_id)
+    kept = runner.invoke(app, ["sessions", "delete", session_id, *where], input="n\n")
+    assert kept.exit_code == 1
+    assert "81 lines" in kept.output
+    run("delete", session_id, "--yes")
+    gone = runner.invoke(app, ["sessions", "show", session_id, *where])
+    assert gone.exit_code == 1
+    assert "there is no session" in gone.output
+
+
+def test_points_and_ledger_are_the_same_after_push_stop_start_and_push_to_the_same_pass(running):
+    service = running.service()
+    session_id = service.create(kind="push")
+
+    def push(first, count):
+        lines = [
+            {
+                "line_index": i,
+                "points_mm": [[0.15 * k, 0.2 * i, 0.0] for k in range(40)],
+                "laser_mm": [3.0, 0.2 * i, 100.0],
+                "line_spacing_mm": 0.2,
+            }
+            for i in range(first, first + count)
+        ]
+        answer = service.client.post(f"/api/v1/sessions/{session_id}/scanlines", json={"lines": lines})
+        assert answer.status_code == 200, answer.text
+
+    for first in (0, 10):
+        service.start(session_id)
+        push(first, 10)
+        if first == 0:
+            act(service, session_id, "stop")
+    push(3, 2)
+    address = f"/api/v1/sessions/{session_id}/points?limit=10000"
+    wait_for(lambda: service.client.get(address).json()["total"] == 800, "the points to be judged")
+    live = service.client.get(address).json()
+    ledger = service.client.get(f"/api/v1/sessions/{session_id}/ledger").json()
+    time.sleep(2.5)  # verdict and ledger are kept about every second
+    live = service.client.get(address).json()
+    service.kill()
+    service = running.service()
+    again = service.client.get(address).json()
+    for name in set(live) - {"version"}:
+        assert again[name] == live[name], name
+    after = service.client.get(f"/api/v1/sessions/{session_id}/ledger").json()
+    assert after["passes"] == ledger["passes"]
+    assert after["lines"] == ledger["lines"]
+
+
+def test_a_revoked_key_and_a_logout_end_the_streams_that_were_opened_with_them(tmp_path):
+    from scanner_service.api.app import make_app
+    from scanner_service.api.keys import Role
+    from scanner_service.api.server import ServerThread
+    from scanner_service.api.service import Service
+    from scanner_service.sessions.source_specs import PushSpec
+
+    service = Service.open(tmp_path)
+    try:
+        session = service.book.create("watched", PushSpec())
+        keys = [service.access.create_key(Role.VIEWER, name) for name in ("gone", "kept")]
+        with ServerThread(make_app(service)) as listening:
+            url = f"{listening.url.replace('http', 'ws')}/api/v1/sessions/{session.row.session_id}/live"
+            first, second = (
+                websockets.sync.client.connect(url, additional_headers={"Authorization": f"Bearer {key}"})
+                for key in keys
+            )
+            with first, second:
+                for socket in (first, second):
+                    assert json.loads(socket.recv(timeout=20))["type"] == "status"
+                (stored,) = (key for key in service.access.keys if key.label == "gone")
+                assert service.access.revoke_key(stored.key_id)
+                with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
+                    while True:
+                        told = json.loads(first.recv(timeout=20))
+                assert (told["type"], closed.value.rcvd.code) == ("error", 1008)
+                told = [json.loads(second.recv(timeout=20))["type"] for _ in range(5)]
+                assert "status" in told and "error" not in told
+    finally:
+        service.close()
+
+
+def test_the_live_stream_tells_how_far_a_session_is_that_is_being_reopened(running):
+    service = running.service()
+    session_id = service.create(kind="push")
+    service.start(session_id)
+    lines = [
+        {
+            "line_index": i,
+            "points_mm": [[0.15 * k, 0.2 * i, 0.0] for k in range(200)],
+            "laser_mm": [3.0, 0.2 * i, 100.0],
+            "line_spacing_mm": 0.2,
+        }
+        for i in range(600)
+    ]
+    for first in range(0, 600, 100):
+        service.client.post(f"/api/v1/sessions/{session_id}/scanlines", json={"lines": lines[first : first + 100]})
+    service.kill()
+    service = running.service()
+    with live_client(service, session_id) as client:
+        told = [json.loads(client.socket.recv(timeout=30))]
+        while told[-1]["type"] != "status":
+            told.append(json.loads(client.socket.recv(timeout=30)))
+    opening = [message for message in told if message["type"] == "opening"]
+    assert [message["lines"] for message in opening] == sorted(message["lines"] for message in opening)
+    assert all(0 <= message["progress"] <= 1 and message["of"] == 600 for message in opening)
+    rows = read_ply(service.client.get(f"/api/v1/sessions/{session_id}/export/points.ply").content)
+    assert len(rows) == told[-1]["points"] == 600 * 200
