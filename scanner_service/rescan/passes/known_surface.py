@@ -32,7 +32,8 @@ class KnownSurface:
     `state` (i, j, k) is UNTOUCHED, FREE, HIDDEN or SURFACE as in `marching`. One row a cell with points:
     `points_mm`, `normals` (m, 3; unit, towards the laser), `area_mm2`, `count`, `failing_share` (m,) and `region` (m,),
     the number that failing points gave (0: none); `two_sided` (m,) where both sides of a thin wall were seen.
-    `frontier_mm`, `frontier_normals` (f, 3) and `frontier_mm2` (f,) are where hidden space begins: surface that no point has touched may be there.
+    `frontier_mm`, `frontier_normals` (f, 3) and `frontier_mm2` (f,) are where hidden space begins: surface that no
+    point has touched may be there.
     """
 
     low_mm: Float64Array
@@ -50,17 +51,10 @@ class KnownSurface:
     frontier_mm2: Float64Array
 
     def __post_init__(self) -> None:
-        for array in (self.low_mm, self.state, self.points_mm, self.normals, self.area_mm2, self.count):
-            read_only(array)
-        for array in (
-            self.failing_share,
-            self.region,
-            self.two_sided,
-            self.frontier_mm,
-            self.frontier_normals,
-            self.frontier_mm2,
-        ):
-            read_only(array)
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray):
+                read_only(value)
 
     def keys(self, places_mm: Float64Array) -> IntArray:
         """(n,) one number for the cell that each place (n, 3) lies in, clipped to the grid."""
