@@ -182,6 +182,8 @@ class LiveSession:
             ):
                 source.towards_sensor = None  # the passes look from several sides: each is judged by its own rays
             self.source, self._state = source, "scanning"
+            self._earlier_s = self.elapsed_s()
+            self._begun_s, self._ended_s = self._clock(), None
             try:
                 source.start(self)
             except BaseException:
