@@ -16,6 +16,7 @@ from scanner_service.commands.export import export_command, verify_command
 from scanner_service.commands.open_viewer import open_command
 from scanner_service.commands.replay import replay_command
 from scanner_service.commands.report import report_command
+from scanner_service.commands.rescan import rescan_command
 from scanner_service.commands.scan import scan_command
 from scanner_service.commands.serve import DEFAULT_DATA, serve_command
 from scanner_service.commands.sessions import sessions_app
@@ -36,6 +37,7 @@ app.command("devices")(devices_command)
 app.command("doctor")(doctor_command)
 app.command("replay")(replay_command)
 app.command("analyse")(analyse_command)
+app.command("rescan")(rescan_command)
 app.command("compare")(compare_command)
 app.command("export")(export_command)
 app.command("report")(report_command)

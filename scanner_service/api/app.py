@@ -15,9 +15,10 @@ from scanner_service.api.guard import Guard, GuardRules
 from scanner_service.api.login import login_router
 from scanner_service.api.origins import Allowlist
 from scanner_service.api.problems import Problem, ProblemTable, register_problems
-from scanner_service.api.routes import analyses, exports, health, live, results, scanlines, sessions
+from scanner_service.api.routes import analyses, exports, health, live, passes, results, scanlines, sessions
 from scanner_service.api.scopes import Scoped, check_every_route_declares_a_scope, public
 from scanner_service.api.service import Service
+from scanner_service.rescan.passes.errors import PassOutOfReach, PlanningError
 from scanner_service.rescan.reference import ReferenceUnusable
 from scanner_service.rescan.requirement import RequirementUnusable
 from scanner_service.sessions.errors import (
@@ -26,6 +27,7 @@ from scanner_service.sessions.errors import (
     AnalysisUnknown,
     BudgetSpent,
     LineRefused,
+    PassUnknown,
     SessionBusy,
     SessionError,
     SessionNotLive,
@@ -43,6 +45,9 @@ SESSION_PROBLEMS: ProblemTable = {
     NotConfirmed: Problem(409, "not-confirmed", "Deleting needs a confirmation"),
     CreationKeyReused: Problem(422, "idempotency-key-reused", "The key came before, with another request"),
     SessionError: Problem(409, "session-error", "The session cannot do that"),
+    PassUnknown: Problem(404, "pass-unknown", "There is no such pass"),
+    PassOutOfReach: Problem(422, "pass-out-of-reach", "The pass would leave the limits of the rig"),
+    PlanningError: Problem(409, "planning-impossible", "No pass can be planned"),
     SourceUnusable: Problem(422, "source-unusable", "The source cannot be read"),
     FormatError: Problem(422, "file-unusable", "The file cannot be read"),
     LineRefused: Problem(409, "line-refused", "The scanline was not taken"),
@@ -83,7 +88,7 @@ def make_app(service: Service, allowlist: Allowlist | None = None) -> ASGIApp:
     register_problems(app, problems)
     install_docs(app, problems.values())
     app.include_router(login_router())
-    for module in (health, sessions, scanlines, results, exports, live, analyses):
+    for module in (health, sessions, scanlines, results, passes, exports, live, analyses):
         app.include_router(module.router)
 
     @app.get("/", dependencies=[Depends(public)], include_in_schema=False)

@@ -19,11 +19,13 @@ Vector = tuple[Finite, Finite, Finite]
 MAX_PLACES = 100_000
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
+    """A body in which every field is known, and nothing changes."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class DeviceSourceIn(_Strict):
+class DeviceSourceIn(Strict):
     """One pass of a scanner that speaks the native protocol.
 
     `rearm`: after an interruption longer than the device's dead-man the laser is switched on again by itself and the
@@ -40,7 +42,7 @@ class DeviceSourceIn(_Strict):
     rearm: bool = False
 
 
-class RigSourceIn(_Strict):
+class RigSourceIn(Strict):
     """One pass of a rig whose file lies in the service's folder of rigs; `rig` is its bare name. It moves the stage."""
 
     kind: Literal["rig"]
@@ -53,7 +55,7 @@ class RigSourceIn(_Strict):
     at_mm: Finite | None = None
 
 
-class ReplaySourceIn(_Strict):
+class ReplaySourceIn(Strict):
     """A recorded scan that lies in the service's replay folder; `file` is its bare name."""
 
     kind: Literal["replay"]
@@ -64,7 +66,7 @@ class ReplaySourceIn(_Strict):
     laser_mm: Vector | None = None
 
 
-class PushSourceIn(_Strict):
+class PushSourceIn(Strict):
     """Scanlines that the client pushes."""
 
     kind: Literal["push"]
@@ -73,14 +75,14 @@ class PushSourceIn(_Strict):
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-class InterestIn(_Strict):
+class InterestIn(Strict):
     """A box along the axes of the part frame, millimetres; only surface in it is judged."""
 
     low_mm: Vector
     high_mm: Vector
 
 
-class RequirementIn(_Strict):
+class RequirementIn(Strict):
     """What the scan must reach: a preset, and what is asked for in its place; what is left out is not asked for."""
 
     preset: Annotated[str, Field(max_length=50, examples=["standard"])] | None = None
@@ -104,14 +106,14 @@ class RequirementIn(_Strict):
         )
 
 
-class ReferenceIn(_Strict):
+class ReferenceIn(Strict):
     """The nominal part: an STL or OBJ file in the service's replay folder, registered to the part frame."""
 
     file: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00]+$", examples=["nominal.stl"])]
     units: Literal["mm", "m", "inch"] = "mm"
 
 
-class SettingsIn(_Strict):
+class SettingsIn(Strict):
     """Radius, reliability and requirement; everything may be left out."""
 
     radius_rule: LiveRule = "line"
@@ -135,7 +137,7 @@ class SettingsIn(_Strict):
         )
 
 
-class SessionIn(_Strict):
+class SessionIn(Strict):
     """A session to be made."""
 
     name: Annotated[str, Field(min_length=1, max_length=200)] = "scan"
@@ -144,14 +146,14 @@ class SessionIn(_Strict):
     origin_mm: Vector = (0.0, 0.0, 0.0)
 
 
-class DescriptionIn(_Strict):
+class DescriptionIn(Strict):
     """What a person says of a session; what is left out stays."""
 
     name: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     notes: Annotated[str, Field(max_length=20_000)] | None = None
 
 
-class ScanlineIn(_Strict):
+class ScanlineIn(Strict):
     """One scanline in the part frame; a point without a return is null.
 
     A line is known by device, boot and index: pushed again it is answered as `duplicate` and not stored twice.
@@ -198,14 +200,14 @@ class ScanlineIn(_Strict):
         )
 
 
-class SessionPointsIn(_Strict):
+class SessionPointsIn(Strict):
     """The points of a session, each normal turned to the laser of its own scanline."""
 
     kind: Literal["session"]
     session_id: Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[0-9a-z]+$", examples=["1m82614ch5ada4"])]
 
 
-class FilePointsIn(_Strict):
+class FilePointsIn(Strict):
     """A cloud that lies in the service's replay folder; `file` is its bare name."""
 
     kind: Literal["file"]
@@ -217,7 +219,7 @@ class FilePointsIn(_Strict):
 Length = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
 
 
-class MethodOptionsIn(_Strict):
+class MethodOptionsIn(Strict):
     """What a method is told; each reads its own, and what is left out it chooses itself."""
 
     radius_mm: Length | None = None
@@ -234,7 +236,7 @@ class MethodOptionsIn(_Strict):
         return NormalOptions(max_error_rad=math.radians(values.pop("max_error_deg")), **values)
 
 
-class AnalysisIn(_Strict):
+class AnalysisIn(Strict):
     """A method, and the points it is to work on."""
 
     method: Annotated[str, Field(min_length=1, max_length=60, examples=["gaussian", "bivariate_quadric"])]
@@ -242,7 +244,7 @@ class AnalysisIn(_Strict):
     options: MethodOptionsIn = MethodOptionsIn()
 
 
-class PassIn(_Strict):
+class PassIn(Strict):
     """What names a pass within a session."""
 
     device_id: Annotated[str, Field(min_length=1, max_length=200)]
@@ -250,7 +252,7 @@ class PassIn(_Strict):
     pass_index: Annotated[int, Field(ge=0, lt=2**31)]
 
 
-class ScanlinesIn(_Strict):
+class ScanlinesIn(Strict):
     """Scanlines, in the order in which they were taken."""
 
     lines: Annotated[list[ScanlineIn], Field(min_length=1, max_length=256)]

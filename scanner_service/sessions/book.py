@@ -11,6 +11,7 @@ from pathlib import Path
 from scanner_service.rescan.reference import ReferenceSurface, ReferenceUnusable
 from scanner_service.sessions.calibration import calibration_of, geometry_from, towards_sensor_from
 from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SessionError, SourceUnusable
+from scanner_service.sessions.pass_desk import PassDesk
 from scanner_service.sessions.references import open_reference
 from scanner_service.sessions.retention import OVER, Kept, Retention, choose
 from scanner_service.sessions.session import LiveSession
@@ -56,6 +57,7 @@ class SessionBook:
         self.retention = retention or Retention()
         self._clock = clock
         self._live: dict[str, LiveSession] = {}
+        self._desks: dict[str, tuple[LiveSession, PassDesk]] = {}
         self._opening: dict[str, Opening] = {}
         self._creating: set[str] = set()
         self._failures: dict[str, str] = {}
@@ -200,6 +202,14 @@ class SessionBook:
         """How far a session is that is being reopened; None when it is not."""
         return self._opening.get(session_id)
 
+    def pass_desk(self, session: LiveSession) -> PassDesk:
+        """The desk where the session's recommended passes are ordered; made when it is first asked for."""
+        with self._lock:
+            known = self._desks.get(session.row.session_id)
+            if known is None or known[0] is not session:
+                known = self._desks[session.row.session_id] = (session, PassDesk(session))
+            return known[1]
+
     def live(self, session_id: str) -> LiveSession | None:
         """The session if it is held open."""
         return self._live.get(session_id)
@@ -227,6 +237,7 @@ class SessionBook:
             opening.done.wait()
         with self._lock:
             live = self._live.pop(session_id, None)
+            self._desks.pop(session_id, None)
             if live is not None:
                 live.close()
             self.record.delete_session(session_id)
@@ -285,6 +296,7 @@ class SessionBook:
             if session.state in OVER:
                 session.close()
                 del self._live[session_id]
+                self._desks.pop(session_id, None)
                 return
         raise SessionBusy(f"{MAX_LIVE} sessions are scanning or waiting: stop one first")
 

@@ -3,6 +3,7 @@
 SessionError
 ├── SessionNotLive      the session is in the record, but not open
 ├── SessionBusy         the request does not fit the session's state
+├── PassUnknown         no such recommended or accepted pass
 ├── BudgetSpent         the disk budget is used up, and no session may be deleted to make room
 ├── SourceUnusable      what the session should read from cannot be read
 ├── LineRefused         one scanline was not taken in, for the reason told
@@ -22,6 +23,10 @@ class SessionNotLive(SessionError):
 
 class SessionBusy(SessionError):
     """The request does not fit the state that the session is in."""
+
+
+class PassUnknown(SessionError):
+    """There is no recommended or accepted pass of that number."""
 
 
 class BudgetSpent(SessionError):

@@ -3,6 +3,7 @@
 import threading
 
 from scanner_service.analysis.compiling import compile_kernels
+from scanner_service.rescan.passes.compiling import compile_planner
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.results import judge
 
@@ -16,8 +17,9 @@ def kernels_are_ready() -> bool:
 
 
 def warm_up() -> None:
-    """Compile every kernel of map and regions, or load it from the cache; returns at once when that was done."""
+    """Compile every kernel of map, regions and passes, or load it from the cache; at once when that was done."""
     with _LOCK:
         if not _READY.is_set():
-            judge(compile_kernels(), Requirement())
+            snapshot = compile_kernels()
+            compile_planner(snapshot, judge(snapshot, Requirement()).report)
             _READY.set()

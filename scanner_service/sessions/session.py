@@ -87,6 +87,7 @@ class LiveSession:
         self._clock = clock
         self._state = row.state
         self._message: str | None = None
+        self._latest: deque[tuple[Scanline, float]] = deque(maxlen=8)
         self._results: Results | None = None
         self._reference = reference
         self._regions = RegionBook()
@@ -177,6 +178,36 @@ class LiveSession:
                 raise
             self._set_state(self._state)
 
+    def carry_out(self, open_source: Callable[[], Source]) -> None:
+        """Scan one more pass of a session that is over, from a source of its own.
+
+        Raises
+        ------
+        SessionBusy : the session is not stopped.
+        SourceUnusable, DriverError : the source cannot be opened or started; the session stays as it was.
+        """
+        with self._lock:
+            if self._state != "stopped":
+                raise SessionBusy(f"the session is {self._state}: a further pass can be scanned once it is stopped")
+            known = self.source
+            source = open_source()
+            if (
+                source.towards_sensor is None
+                or known.towards_sensor is None
+                or not np.allclose(source.towards_sensor, known.towards_sensor)
+            ):
+                source.towards_sensor = None  # the passes look from several sides: each is judged by its own rays
+            self.source, self._state = source, "scanning"
+            self._earlier_s = self.elapsed_s()
+            self._begun_s, self._ended_s = self._clock(), None
+            try:
+                source.start(self)
+            except BaseException:
+                self.source, self._state = known, "stopped"
+                source.stop()
+                raise
+            self._set_state(self._state)
+
     def push(self, line: Scanline) -> "Future[Stored]":
         """Hand over a scanline of a client; the future has the record's answer once the line is durable.
 
@@ -191,6 +222,7 @@ class LiveSession:
                 verb = "resume" if self._state == "paused" else "start"
                 raise SessionBusy(f"the session is {self._state}: {verb} it before pushing scanlines")
             reply: Future[Stored] = Future()
+            self._latest.append((line, self._clock()))
             self.engine.put(line, reply)
             return reply
 
@@ -280,6 +312,8 @@ class LiveSession:
         """A scanline from the source; when the engine is gone, it is counted there and the source is told to stop."""
         if self._state == "paused" and not self._held:  # lines flow again, whatever was or was not said of the link
             self.note("resumed", {})
+        if isinstance(line, Scanline):
+            self._latest.append((line, self._clock()))
         try:
             self.engine.put(line)
         except SessionError as error:
@@ -318,6 +352,14 @@ class LiveSession:
     def read_page(self, changes: Changes, start: int, count: int) -> "Future[PointPage]":
         """What is said of the changed points from number `start` on, at most `count` of them."""
         return self.engine.ask(lambda engine: read_page(engine.live_map, self.verdicts, changes, start, count))
+
+    def latest_lines(self) -> list[tuple[Scanline, float]]:
+        """The last few scanlines with the seconds at which they came, the oldest first."""
+        return list(self._latest)
+
+    def event(self, kind: str, details: dict[str, Any]) -> None:
+        """Put an event into the session's record."""
+        self._event(kind, details)
 
     def results(self) -> Results | None:
         """The latest verdict; None before the first."""

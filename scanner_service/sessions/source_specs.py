@@ -48,8 +48,11 @@ class DeviceSpec:
         if self.start_mm == self.end_mm:
             raise SourceUnusable(f"a pass from {self.start_mm} mm to {self.end_mm} mm has no length")
 
-    def open(self) -> Source:
-        """Open the port and greet the scanner; raises a DriverError when that fails, SourceUnusable for a bad path."""
+    def open(self, rig: Rig | None = None) -> Source:
+        """Open the port and greet the scanner, mounted as `rig` says (None: as by default).
+
+        Raises a DriverError when that fails, SourceUnusable for a bad path.
+        """
         try:
             path = Path(self.port).resolve()
         except (OSError, RuntimeError, ValueError) as error:  # a loop of links, a NUL, half a character
@@ -59,7 +62,7 @@ class DeviceSpec:
         scanner = NativeScanner(self.port, self.baud_rate)
         info = scanner.enter()
         request = PassRequest(self.line_spacing_mm, self.start_mm, self.end_mm, self.line_rate_hz, self.rearm)
-        return DeviceSource(scanner, Rig(), request, info)
+        return DeviceSource(scanner, rig or Rig(), request, info)
 
     def to_dict(self) -> dict[str, Any]:
         """As it is kept in the record."""

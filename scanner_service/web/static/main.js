@@ -8,6 +8,7 @@ import { listenToKeys } from "./keyboard.js";
 import { drawLegend } from "./legend.js";
 import { whole, words } from "./numbers.js";
 import { drawFigures, drawInspector, drawLosses, drawRegions } from "./panels.js";
+import { PassesPanel } from "./passes_panel.js";
 import { pickPoint } from "./picking.js";
 import { PointCloud } from "./point_cloud.js";
 import { RegionOverlay } from "./region_overlay.js";
@@ -35,6 +36,7 @@ const marker = element("div.marker", { hidden: true, "aria-hidden": "true" });
 byId("view").append(marker);
 view.scene.add(cloud.object, overlay.group);
 
+const passes = new PassesPanel(trouble, () => session.open(session.id));
 const exports = new ExportMenu(byId("export-links"), byId("exports"));
 const picker = new SessionPicker({ onChoose: openSession, onMissing: (text) => notice(text), current: () => session.id });
 
@@ -200,6 +202,7 @@ function openSession(chosen) {
   view.touched = false;
   look.range = look.autoRange ? [0, 1] : look.range;
   session.open(chosen.id);
+  passes.open(chosen.id);
   explainEmptiness();
   overlay.show([], session.origin, view.radius);
   drawFigures(byId("figures"), null, session.store, null);

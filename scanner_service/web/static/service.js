@@ -32,6 +32,21 @@ export const startSession = (id) => answer(sessionPath(id, "start"), { method: "
 
 export const stopSession = (id) => answer(sessionPath(id, "stop"), { method: "POST" });
 
+export const listPasses = (id) => answer(sessionPath(id, "recommended-passes"));
+
+export const listOrders = (id) => answer(sessionPath(id, "pass-orders"));
+
+export const loopState = (id) => answer(sessionPath(id, "rescan"));
+
+const send = (path, body, method = "POST") => answer(path, { method, headers: { accept: "application/json", "content-type": "application/json" }, body: JSON.stringify(body) });
+
+export const acceptPass = (id, number) => answer(sessionPath(id, `recommended-passes/${number}/accept`), { method: "POST" });
+
+export const carryOut = (id, order, turned) => send(sessionPath(id, `pass-orders/${order}/carry-out`), { part_is_turned: turned });
+
+export const startLoop = (id) => send(sessionPath(id, "rescan"), {});
+
+export const endLoop = (id) => answer(sessionPath(id, "rescan"), { method: "DELETE" });
 export const pauseSession = (id) => answer(sessionPath(id, "pause"), { method: "POST" });
 
 export const resumeSession = (id) => answer(sessionPath(id, "resume"), { method: "POST" });

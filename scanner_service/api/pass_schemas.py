@@ -1,0 +1,96 @@
+"""What requests about passes may say: rig, loop, order; angles in degrees only here."""
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from drivers.rig_limits import AxisKind, RigLimits
+from drivers.scanline import SensorGeometry
+from scanner_service.api.schemas import Finite, Strict, Vector
+from scanner_service.rescan.passes.errors import RigUnlimited
+from scanner_service.rescan.passes.reach import Reach
+from scanner_service.sessions.pass_desk import LoopLimits, RigSetup, optics_stated
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class ScannerIn(Strict):
+    """The optics of a scanner in its sensor frame: x along the laser line, z towards the sensor."""
+
+    laser_mm: Vector
+    camera_mm: Vector
+    range_mm: tuple[Finite, Finite]
+    field_of_view_mm: Positive
+    points_per_line: Annotated[int, Field(ge=2, le=100_000)]
+    noise_mm: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.01
+    max_incidence_deg: Annotated[float, Field(gt=0, lt=90, allow_inf_nan=False)] = 60.0
+
+
+class RigIn(Strict):
+    """What a rig can do: a linear axis between two ends, or a sensor that is held in any pose within a box."""
+
+    axis: Literal["linear", "free_pose"]
+    scanner: ScannerIn
+    travel_mm: tuple[Finite, Finite] | None = None
+    reach_low_mm: Vector | None = None
+    reach_high_mm: Vector | None = None
+    max_tilt_deg: Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)] = 70.0
+    line_rate_hz: Positive = 50.0
+    speed_mm_per_s: Positive = 50.0
+    line_spacing_mm: tuple[Positive, Positive] = (0.05, 1.0)
+    part_may_turn: bool = True
+
+    def to_setup(self) -> RigSetup:
+        """As the pass desk takes it; raises PlanningError or ValueError when it cannot be meant."""
+        optics = self.scanner
+        geometry = SensorGeometry(
+            np.array(optics.laser_mm), np.array(optics.camera_mm), optics.range_mm, optics.noise_mm
+        )
+        half = 0.5 * optics.field_of_view_mm
+        box = None
+        if self.axis == "linear" and self.travel_mm is None:
+            raise RigUnlimited("the ends of the stage's travel are not known: state travel_mm of the rig")
+        if self.reach_low_mm is not None and self.reach_high_mm is not None:
+            box = (self.reach_low_mm, self.reach_high_mm)
+        travel = (-math.inf, math.inf) if self.travel_mm is None else self.travel_mm
+        if not travel[0] < travel[1]:
+            raise RigUnlimited(f"travel_mm must be (lowest, highest), not {list(travel)}")
+        limits = RigLimits(
+            AxisKind(self.axis),
+            travel,
+            (0.0, self.speed_mm_per_s),
+            (0.0, self.line_rate_hz),
+            geometry,
+            (-half, half),
+            reach_mm=box,
+        )
+        reach = Reach(
+            limits,
+            max_tilt_rad=math.radians(self.max_tilt_deg),
+            part_may_turn=self.part_may_turn,
+            line_spacing_mm=self.line_spacing_mm,
+        )
+        stated = optics_stated(
+            geometry, optics.field_of_view_mm, optics.points_per_line, math.radians(optics.max_incidence_deg)
+        )
+        return RigSetup(reach, stated)
+
+
+class CarryOutIn(Strict):
+    """Whether the part lies as the pass asks."""
+
+    part_is_turned: bool = False
+
+
+class LoopIn(Strict):
+    """When a closed loop ends at the latest."""
+
+    max_passes: Annotated[int, Field(ge=1, le=200)] = 20
+    max_seconds: Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)] = 600.0
+    coverage_share: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] | None = None
+
+    def to_limits(self) -> LoopLimits:
+        """As the pass desk takes them."""
+        return LoopLimits(self.max_passes, self.max_seconds, self.coverage_share)

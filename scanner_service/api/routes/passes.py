@@ -1,0 +1,94 @@
+"""Recommended passes: list, accept, carry out, guide, loop; every call is one call of the session's pass desk."""
+
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, Depends, Request
+from starlette.responses import Response
+
+from scanner_service.api.answers import answer
+from scanner_service.api.pass_schemas import CarryOutIn, LoopIn, RigIn
+from scanner_service.api.routes.sessions import Session, book_of, operator, viewer
+from scanner_service.sessions.pass_desk import PassDesk
+
+router = APIRouter(prefix="/api/v1/sessions/{session_id}", tags=["passes"])
+
+
+def desk_of(request: Request, session: Session) -> PassDesk:
+    """The session's pass desk."""
+    return book_of(request).pass_desk(session)
+
+
+Desk = Annotated[PassDesk, Depends(desk_of)]
+
+
+@router.put("/rig", dependencies=[operator])
+def state_rig(desk: Desk, body: RigIn) -> Response:
+    """State what the rig can do and what the scanner can see; needed where the service does not drive the scanner."""
+    desk.describe_rig(body.to_setup())
+    return answer({"stated": body.model_dump()})
+
+
+@router.get("/recommended-passes", dependencies=[viewer])
+def list_passes(desk: Desk) -> Response:
+    """The recommended passes for the map as it is, the best for its time first, and what none of them can bring."""
+    return answer(desk.plan().to_dict())
+
+
+@router.post("/recommended-passes/{number}/accept", status_code=201, dependencies=[operator])
+def accept_pass(desk: Desk, number: int) -> Response:
+    """Take an order for a pass of the latest plan. Nothing moves before it is carried out."""
+    return answer(desk.accept(number).to_dict(), 201)
+
+
+@router.get("/pass-orders", dependencies=[viewer])
+def list_orders(desk: Desk) -> Response:
+    """Passes that were accepted, with what they promised and what they brought."""
+    return answer({"orders": [order.to_dict() for order in desk.orders()]})
+
+
+@router.get("/pass-orders/{order}", dependencies=[viewer])
+def get_order(desk: Desk, order: int) -> Response:
+    """One accepted pass."""
+    return answer(desk.order(order).to_dict())
+
+
+@router.post("/pass-orders/{order}/carry-out", dependencies=[operator])
+def carry_out(desk: Desk, order: int, body: CarryOutIn) -> Response:
+    """Drive an accepted pass, or wait for the scanlines that a hand brings. The laser is switched on."""
+    return answer(desk.carry_out(order, body.part_is_turned).to_dict())
+
+
+@router.get("/pass-orders/{order}/guidance", dependencies=[viewer])
+def get_guidance(desk: Desk, order: int) -> Response:
+    """Where the scanner is beside an accepted pass: how far, which way, how fast."""
+    found = desk.guidance(order)
+    return answer(
+        {
+            "along_mm": found.along_mm,
+            "aside_mm": found.aside_mm,
+            "angle_deg": float(np.degrees(found.angle_rad)),
+            "speed_mm_per_s": found.speed_mm_per_s,
+            "wanted_mm_per_s": found.wanted_mm_per_s,
+            "say": found.say,
+        }
+    )
+
+
+@router.post("/rescan", status_code=202, dependencies=[operator])
+def start_loop(desk: Desk, body: LoopIn) -> Response:
+    """Plan and carry out by itself until the requirement holds, nothing reachable is left, or a limit is met."""
+    return answer(desk.run_loop(body.to_limits()).to_dict(), 202)
+
+
+@router.get("/rescan", dependencies=[viewer])
+def get_loop(desk: Desk) -> Response:
+    """The closed loop: how far it is, or why it ended; null when there was none."""
+    return answer({"loop": desk.loop.to_dict() if desk.loop is not None else None})
+
+
+@router.delete("/rescan", status_code=202, dependencies=[operator])
+def end_loop(desk: Desk) -> Response:
+    """End the closed loop after the pass that is under way."""
+    desk.end_loop()
+    return answer({"loop": desk.loop.to_dict() if desk.loop is not None else None}, 202)

@@ -1,0 +1,140 @@
+"""`scanner rescan`: recommended passes of a session of a running service: list, carry out, or the whole closed loop."""
+
+import time
+from typing import Annotated, Any
+
+import httpx
+import typer
+from rich.table import Table
+
+from scanner_service.api.keys import read_local_key
+from scanner_service.commands.serve import DEFAULT_DATA, Data
+from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json
+
+_POLL_S = 0.3
+
+
+def rescan_command(
+    session: Annotated[str, typer.Argument(help="The session's id, or `latest`.")],
+    carry_out: Annotated[int | None, typer.Option("--pass", help="Carry out this pass of the list.")] = None,
+    turned: Annotated[bool, typer.Option("--turned", help="The part lies as the pass asks.")] = False,
+    auto: Annotated[bool, typer.Option("--auto", help="Repeat until nothing is left to do.")] = False,
+    max_passes: Annotated[int, typer.Option(min=1, max=200, help="Most passes of --auto.")] = 20,
+    max_seconds: Annotated[float, typer.Option(min=1.0, help="Most seconds of passes of --auto.")] = 600.0,
+    data: Data = DEFAULT_DATA,
+    url: Annotated[str, typer.Option(help="Where the service listens.")] = "http://127.0.0.1:8765",
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """List the recommended passes of a session, carry one out, or all of them by themselves."""
+    with plain_errors():
+        key = read_local_key(data)
+        if key is None:
+            fail(f"there is no key in {data}: start `scanner serve` first, or name its folder with --data")
+        if auto and carry_out is not None:
+            fail("say either --pass or --auto")
+        head = {"Authorization": f"Bearer {key}"}
+        with httpx.Client(base_url=url, headers=head, timeout=120.0) as client:
+            where = f"/api/v1/sessions/{_session_id(client, session)}"
+            if auto:
+                result = _loop(client, where, {"max_passes": max_passes, "max_seconds": max_seconds}, as_json)
+            elif carry_out is not None:
+                result = _one(client, where, carry_out, turned)
+            else:
+                result = _ask(client.get(f"{where}/recommended-passes"))
+        if as_json:
+            show_json(result)
+        elif auto:
+            _tell_orders(result["orders"])
+            console.print(f"The loop ended: {result['loop']['why_ended']}.", highlight=False, soft_wrap=True)
+        elif carry_out is not None:
+            _tell_orders([result])
+        else:
+            _tell_plan(result)
+
+
+def _session_id(client: httpx.Client, wanted: str) -> str:
+    if wanted != "latest":
+        return wanted
+    found = _ask(client.get("/api/v1/sessions", params={"limit": 1}))["sessions"]
+    if not found:
+        fail("the service has no session yet: scan a part first")
+    return str(found[0]["id"])
+
+
+def _loop(client: httpx.Client, where: str, limits: dict[str, Any], quiet: bool) -> dict[str, Any]:
+    """Start the closed loop and follow it to its end."""
+    before = len(_ask(client.get(f"{where}/pass-orders"))["orders"])
+    _ask(client.post(f"{where}/rescan", json=limits))
+    told = before
+    while True:
+        loop = _ask(client.get(f"{where}/rescan"))["loop"]
+        orders = _ask(client.get(f"{where}/pass-orders"))["orders"]
+        while told < len(orders) and orders[told]["status"] in ("done", "failed"):
+            if not quiet:
+                errors.print(_said(orders[told]), highlight=False)
+            told += 1
+        if not loop["running"]:
+            return {"loop": loop, "orders": orders[before:]}
+        time.sleep(_POLL_S)
+
+
+def _one(client: httpx.Client, where: str, number: int, turned: bool) -> dict[str, Any]:
+    """Accept a pass, carry it out and wait for its end; a hand is guided meanwhile."""
+    order = _ask(client.post(f"{where}/recommended-passes/{number}/accept"))
+    mine = f"{where}/pass-orders/{order['order']}"
+    _ask(client.post(f"{mine}/carry-out", json={"part_is_turned": turned}))
+    by_hand = _ask(client.get(where))["source"]["kind"] == "push"
+    said = ""
+    while True:
+        order = _ask(client.get(mine))
+        if order["status"] in ("done", "failed"):
+            return dict(order)
+        if by_hand:
+            guidance = client.get(f"{mine}/guidance")
+            now = guidance.json()["say"] if guidance.is_success else guidance.json()["detail"]
+            if now != said:
+                said = now
+                errors.print(now, highlight=False, soft_wrap=True)
+        time.sleep(_POLL_S)
+
+
+def _said(order: dict[str, Any]) -> str:
+    one = order["pass"]
+    head = f"{one['start_mm']:.1f} to {one['end_mm']:.1f} mm, lines {one['line_spacing_mm']:.3f} mm apart"
+    if order["outcome"] is None:
+        return f"{head}: {order['message'] or order['status']}"
+    outcome = order["outcome"]
+    return f"{head}: promised {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²"
+
+
+def _tell_plan(plan: dict[str, Any]) -> None:
+    table = Table(title="Recommended passes", title_justify="left")
+    for name in ("#", "from mm", "to mm", "spacing mm", "lines", "s", "gain mm²", "mm²/s"):
+        table.add_column(name, justify="right")
+    table.add_column("serves")
+    table.add_column("first")
+    for one in plan["passes"]:
+        named = [str(item["region"]) for item in one["serves"] if item["region"] is not None]
+        more = f" and {len(named) - 3} more" if len(named) > 3 else ""
+        unseen = "unseen surface" if len(named) < len(one["serves"]) else ""
+        serves = ", ".join(filter(None, (f"regions {', '.join(named[:3])}{more}" if named else "", unseen)))
+        table.add_row(
+            str(one["number"]), f"{one['start_mm']:.1f}", f"{one['end_mm']:.1f}", f"{one['line_spacing_mm']:.3f}",
+            str(one["lines"]), f"{one['duration_s'] + one['approach_s']:.1f}", f"{one['gain_mm2']:.0f}",
+            f"{one['gain_per_s_mm2']:.1f}", serves, one["turn_part"] or "",
+        )  # fmt: skip
+    console.print(table)
+    for lost in plan["unreachable"]:
+        what = "surface outside of any region" if lost["region"] is None else f"region {lost['region']}"
+        console.print(f"{what}: {lost['area_mm2']:.1f} mm² unreachable: {lost['why']}", highlight=False, soft_wrap=True)
+
+
+def _tell_orders(orders: list[dict[str, Any]]) -> None:
+    for order in orders:
+        console.print(f"pass {order['order']}: {_said(order)}", highlight=False, soft_wrap=True)
+
+
+def _ask(response: httpx.Response) -> Any:
+    if response.is_error:
+        fail(f"the service refused: {response.json().get('detail', response.text)}")
+    return response.json()

@@ -1,0 +1,1 @@
+"""Recommended passes: what a rig can do, what it would see, what that gains; pure."""

@@ -1,0 +1,182 @@
+"""The surface as far as a map knows it: cells with a place and a normal, and what is solid, hidden or free around them.
+
+Made from the map's own points: each point is surface, the way from it to its laser is free, and what lies behind it is
+hidden unless another ray went through. Knows no regions' reasons and no rig.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.scanline import BoolArray, Float64Array, read_only
+from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.rescan.passes.looks import Look, mark_empty
+from scanner_service.rescan.passes.marching import SURFACE, carve, fill_pockets, gather, open_faces, outward
+from scanner_service.rescan.passes.optics import ScannerOptics
+
+IntArray = npt.NDArray[np.int64]
+MAX_CELLS = 6_000_000
+MAX_OPEN = 200_000
+LEAST_CELL_MM = 0.5
+_LINES_IN_A_CELL = 1.3  # so that a surface at the coarsest line spacing leaves no cell empty
+_ONE_SIDED = 0.6  # length of the mean normal below which the normals of a cell point both ways
+_MARGIN_MM = 1.5  # how far beyond the outermost points hidden surface is reckoned with: the next pass sees further
+
+
+@dataclass(frozen=True, slots=True)
+class KnownSurface:
+    """What is known of a part, in cells of side `cell_mm` from the corner `low_mm` (3,), part frame.
+
+    `state` (i, j, k) is UNTOUCHED, FREE, HIDDEN or SURFACE as in `marching`. One row a cell with points:
+    `points_mm`, `normals` (m, 3; unit, towards the laser), `area_mm2`, `count`, `failing_share` (m,) and `region` (m,),
+    the number that failing points gave (0: none); `two_sided` (m,) where both sides of a thin wall were seen.
+    `frontier_mm`, `frontier_normals` (f, 3) and `frontier_mm2` (f,) are where hidden space begins: surface that no
+    point has touched may be there.
+    """
+
+    low_mm: Float64Array
+    cell_mm: float
+    state: npt.NDArray[np.uint8]
+    points_mm: Float64Array
+    normals: Float64Array
+    area_mm2: Float64Array
+    count: IntArray
+    failing_share: Float64Array
+    region: IntArray
+    two_sided: BoolArray
+    frontier_mm: Float64Array
+    frontier_normals: Float64Array
+    frontier_mm2: Float64Array
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray):
+                read_only(value)
+
+    def keys(self, places_mm: Float64Array) -> IntArray:
+        """(n,) one number for the cell that each place (n, 3) lies in, clipped to the grid."""
+        at = np.floor((places_mm - self.low_mm) / self.cell_mm).astype(np.int64)
+        at = np.clip(at, 0, np.array(self.state.shape) - 1)
+        return np.asarray(np.ravel_multi_index((at[:, 0], at[:, 1], at[:, 2]), self.state.shape), dtype=np.int64)
+
+
+def know_surface(
+    snapshot: MapSnapshot,
+    fails: BoolArray,
+    region: npt.NDArray[np.int32],
+    cell_mm: float | None = None,
+    looks: tuple[Look, ...] = (),
+    optics: ScannerOptics | None = None,
+) -> KnownSurface:
+    """The surface a map knows.
+
+    Parameters
+    ----------
+    snapshot : the live map; points that are not counted are left out.
+    fails : (n,) True for points that do not meet the requirement.
+    region : (n,) number of the region of a failing point, 0 for none.
+    cell_mm : side of a cell; None: wide enough for the map's line spacing and for at most MAX_CELLS cells.
+    looks, optics : passes whose poses are known, and the scanner's: what they looked into in vain is not hidden.
+    """
+    use = snapshot.neighbours > 0
+    points = snapshot.points_mm
+    if not use.any():
+        return _nothing()
+    mine = points[use]
+    low, high = mine.min(axis=0), mine.max(axis=0)
+    margin = _MARGIN_MM
+    side = _cell_side(snapshot, low - margin, high + margin) if cell_mm is None else cell_mm
+    low = low - margin
+    shape = tuple(math.ceil(float(extent) / side) + 1 for extent in high + margin - low)
+    index = np.full(shape, -1, dtype=np.int32)
+    sums = np.zeros((min(int(use.sum()), int(np.prod(shape))), 10))
+    bits = np.zeros(len(sums), dtype=np.uint64)
+    first = np.zeros(len(points), dtype=np.bool_)
+    lines = snapshot.lines
+    count = gather(
+        points, use, snapshot.line, lines.pass_number, snapshot.normals, fails, region, low, side, index, sums, first,
+        bits,
+    )  # fmt: skip
+    sums = sums[:count]
+    state = np.where(index >= 0, SURFACE, 0).astype(np.uint8)
+    carve(state, low, side, np.flatnonzero(first), points, snapshot.line, lines.laser_mm, math.inf)
+    fill_pockets(state, 3)
+    places = sums[:, :3] / sums[:, 6:7]
+    normals = _normals(sums[:, 3:6], state, low, side, places, lines.laser_mm)
+    # so many cells does a plane of this slope cut through on a square of one cell
+    area = side * side / np.maximum(np.abs(normals).sum(axis=1), 1.0)
+    open_cells, gradient = _frontier(state)
+    if looks and optics is not None and mark_empty(state, low, side, looks, optics, open_cells, gradient):
+        open_cells, gradient = _frontier(state)
+    return KnownSurface(
+        low_mm=low,
+        cell_mm=side,
+        state=state,
+        points_mm=places,
+        normals=normals,
+        area_mm2=area,
+        count=sums[:, 6].astype(np.int64),
+        failing_share=sums[:, 7] / sums[:, 6],
+        region=sums[:, 8].astype(np.int64),
+        two_sided=np.linalg.norm(sums[:, 3:6], axis=1) < _ONE_SIDED * sums[:, 9],
+        frontier_mm=low + (open_cells + 0.5) * side,
+        frontier_normals=gradient,
+        frontier_mm2=side * side / np.maximum(np.abs(gradient).max(axis=1, initial=0.5), 0.5),
+    )
+
+
+def _frontier(state: npt.NDArray[np.uint8]) -> tuple[IntArray, Float64Array]:
+    """Cells (f, 3) where hidden space begins, and where they face (f, 3); those that face nowhere are left out."""
+    cells = np.empty((MAX_OPEN, 3), dtype=np.int64)
+    cells = cells[: open_faces(state, cells)]
+    gradient = np.zeros((len(cells), 3))
+    outward(state, cells, gradient)
+    length = np.linalg.norm(gradient, axis=1)
+    sure = length > 1.0
+    return cells[sure], gradient[sure] / length[sure, None]
+
+
+def _cell_side(snapshot: MapSnapshot, low: Float64Array, high: Float64Array) -> float:
+    spacing = snapshot.lines.line_spacing_mm[~snapshot.lines.stationary]
+    along = snapshot.lines.point_spacing_mm
+    coarsest = max(
+        float(np.median(spacing)) if len(spacing) else 0.0, float(np.nanmedian(along)) if len(along) else 0.0
+    )
+    by_lines = max(LEAST_CELL_MM, _LINES_IN_A_CELL * coarsest)
+    volume_mm3 = float(np.prod(high - low))
+    return max(by_lines, float((volume_mm3 / MAX_CELLS) ** (1.0 / 3.0)))
+
+
+def _normals(
+    sums: Float64Array,
+    state: npt.NDArray[np.uint8],
+    low: Float64Array,
+    side: float,
+    places: Float64Array,
+    lasers: Float64Array,
+) -> Float64Array:
+    """Mean of the reliable normals of each cell; without one, away from what is solid around it."""
+    normals = sums.copy()
+    length = np.linalg.norm(normals, axis=1)
+    without = np.flatnonzero(length < 1e-3)
+    if len(without):
+        gradient = np.zeros((len(without), 3))
+        outward(state, np.floor((places[without] - low) / side).astype(np.int64), gradient)
+        towards = lasers.mean(axis=0) - places[without]
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        size = np.linalg.norm(gradient, axis=1)
+        normals[without] = np.where(size[:, None] > 1.0, gradient, towards)
+        length[without] = np.linalg.norm(normals[without], axis=1)
+    return np.asarray(normals / length[:, None], dtype=np.float64)
+
+
+def _nothing() -> KnownSurface:
+    none, flat = np.zeros((0, 3)), np.zeros(0)
+    whole = np.zeros(0, dtype=np.int64)
+    return KnownSurface(
+        np.zeros(3), LEAST_CELL_MM, np.zeros((1, 1, 1), dtype=np.uint8), none, none.copy(), flat, whole, flat.copy(),
+        whole.copy(), np.zeros(0, dtype=np.bool_), none.copy(), none.copy(), flat.copy(),
+    )  # fmt: skip

@@ -1,0 +1,170 @@
+"""One recommended pass as it is told: where, how, how long, what for and with what result to expect; plans none."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.scanline import Float64Array, Pose, read_only
+from scanner_service.rescan.passes.motion import Motion, StraightMotion
+from scanner_service.rescan.passes.needs import UNSEEN
+from scanner_service.rescan.passes.reach import PartTurn
+
+
+@dataclass(frozen=True, slots=True)
+class Promise:
+    """What a pass is expected to give one region: area, median density, median and largest incidence.
+
+    `region` is the region's number in the report planned from, UNSEEN for surface that no region has found yet.
+    """
+
+    region: int
+    gain_mm2: float
+    density_per_mm2: float
+    incidence_rad: float
+    largest_incidence_rad: float
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON; angles in degrees."""
+        return {
+            "region": None if self.region == UNSEEN else self.region,
+            "gain_mm2": self.gain_mm2,
+            "density_per_mm2": self.density_per_mm2,
+            "incidence_deg": math.degrees(self.incidence_rad),
+            "largest_incidence_deg": math.degrees(self.largest_incidence_rad),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class RecommendedPass:
+    """A pass that can be carried out: the motion from `start_mm` to `end_mm`, lines `line_spacing_mm` apart.
+
+    `duration_s` is the time of the pass itself, `approach_s` the time to get there (turning the part included);
+    `promises` what it is to give, region by region; `gain_mm2` their sum. `places_mm` (k, 3) are the places served,
+    `place_regions` (k,) their regions, `place_mm2` (k,) their areas and `place_normals` (k, 3) where they
+    face; they are kept for the reckoning afterwards.
+    `turn` is what the operator does first; `trust` is what the promises were multiplied by, from earlier outcomes.
+    """
+
+    number: int
+    motion: Motion
+    start_mm: float
+    end_mm: float
+    line_spacing_mm: float
+    line_rate_hz: float
+    duration_s: float
+    approach_s: float
+    promises: tuple[Promise, ...]
+    places_mm: Float64Array
+    place_regions: Float64Array
+    place_mm2: Float64Array
+    place_normals: Float64Array
+    turn: PartTurn | None = None
+    trust: float = 1.0
+
+    def __post_init__(self) -> None:
+        for array in (self.places_mm, self.place_regions, self.place_mm2, self.place_normals):
+            read_only(array)
+
+    @property
+    def gain_mm2(self) -> float:
+        """Surface that is to meet the requirement afterwards and does not now."""
+        return sum(promise.gain_mm2 for promise in self.promises)
+
+    @property
+    def gain_per_s(self) -> float:
+        """What it brings for its time."""
+        return self.gain_mm2 / (self.duration_s + self.approach_s)
+
+    @property
+    def line_count(self) -> int:
+        """Lines, both ends included."""
+        return math.floor(abs(self.end_mm - self.start_mm) / self.line_spacing_mm + 1e-9) + 1
+
+    @property
+    def start_pose(self) -> Pose:
+        """part_from_sensor at the first line."""
+        return self.motion.part_from_sensor(self.start_mm)
+
+    @property
+    def end_pose(self) -> Pose:
+        """part_from_sensor at the last line."""
+        return self.motion.part_from_sensor(self.end_mm)
+
+    @property
+    def direction(self) -> Float64Array:
+        """(3,) unit direction in which the sensor goes at the start, part frame."""
+        if isinstance(self.motion, StraightMotion):
+            return self.motion.travel * math.copysign(1.0, self.end_mm - self.start_mm)
+        around = np.cross(self.motion.axis, self.start_pose.translation_mm)
+        return np.asarray(around / max(float(np.linalg.norm(around)), 1e-12), dtype=np.float64)
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON; what a person or a rig needs to carry it out."""
+        return {
+            "number": self.number,
+            "start_mm": self.start_mm,
+            "end_mm": self.end_mm,
+            "line_spacing_mm": self.line_spacing_mm,
+            "line_rate_hz": self.line_rate_hz,
+            "lines": self.line_count,
+            "duration_s": self.duration_s,
+            "approach_s": self.approach_s,
+            "speed_mm_per_s": self.line_rate_hz * self.line_spacing_mm,
+            "start_pose": pose_dict(self.start_pose),
+            "end_pose": pose_dict(self.end_pose),
+            "direction": self.direction.tolist(),
+            "laser_direction": (-self.start_pose.rotation[:, 2]).tolist(),
+            "turn_part": None if self.turn is None or self.turn.is_none else str(self.turn),
+            "gain_mm2": self.gain_mm2,
+            "gain_per_s_mm2": self.gain_per_s,
+            "serves": [promise.to_dict() for promise in self.promises],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Unreachable:
+    """Surface of one region that no pass within the limits can bring, and why."""
+
+    region: int
+    area_mm2: float
+    share: float
+    why: str
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON."""
+        region = None if self.region == UNSEEN else self.region
+        return {"region": region, "area_mm2": self.area_mm2, "share": self.share, "why": self.why}
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Recommended passes of one version of the map, the best for its time first, and what none of them can bring.
+
+    `needed_mm2` is all that is still wanted, `promised_mm2` what the listed passes are to bring of it.
+    """
+
+    version: int
+    passes: tuple[RecommendedPass, ...]
+    unreachable: tuple[Unreachable, ...]
+    needed_mm2: float
+
+    @property
+    def promised_mm2(self) -> float:
+        """What the listed passes are to bring together."""
+        return sum(one.gain_mm2 for one in self.passes)
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {
+            "version": self.version,
+            "needed_mm2": self.needed_mm2,
+            "promised_mm2": self.promised_mm2,
+            "passes": [one.to_dict() for one in self.passes],
+            "unreachable": [one.to_dict() for one in self.unreachable],
+        }
+
+
+def pose_dict(pose: Pose) -> dict[str, object]:
+    """A pose for JSON: rows of the rotation, and the translation."""
+    return {"rotation": pose.rotation.tolist(), "translation_mm": pose.translation_mm.tolist()}

@@ -1,0 +1,60 @@
+"""What a place on the part can see, laser and camera alike, against all that is solid or hidden; knows no density."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.scanline import BoolArray, Float64Array, read_only
+from scanner_service.rescan.passes.known_surface import KnownSurface
+from scanner_service.rescan.passes.marching import clear_sights, clear_ways
+from scanner_service.rescan.passes.motion import Sights
+
+DIRECTIONS = 480  # about 9 degrees apart
+
+
+def directions_everywhere(count: int = DIRECTIONS) -> Float64Array:
+    """Unit vectors (count, 3) spread evenly over the sphere (Fibonacci lattice, Gonzalez 2010)."""
+    turn = np.arange(count) * math.pi * (3.0 - math.sqrt(5.0))
+    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
+    flat = np.sqrt(1.0 - z * z)
+    return np.column_stack([flat * np.cos(turn), flat * np.sin(turn), z])
+
+
+@dataclass(frozen=True, slots=True)
+class OpenSky:
+    """For each place (n,) which of `directions` (d, 3) lead out of the part unhindered: `open` (n, d)."""
+
+    directions: Float64Array
+    open: BoolArray
+
+    def __post_init__(self) -> None:
+        read_only(self.directions)
+        read_only(self.open)
+
+    def along(self, direction: Float64Array) -> BoolArray:
+        """(n,) whether the sky is open in the listed direction that is nearest to `direction` (3,)."""
+        column: BoolArray = self.open[:, int(np.argmax(self.directions @ direction))]
+        return column
+
+
+def look_around(
+    surface: KnownSurface, places_mm: Float64Array, normals: Float64Array, largest_angle_rad: float
+) -> OpenSky:
+    """The open sky of places (n, 3), up to an angle from their normals (n, 3)."""
+    directions = directions_everywhere()
+    found = np.zeros((len(places_mm), len(directions)), dtype=np.bool_)
+    least = math.cos(min(largest_angle_rad + math.radians(5.0), math.pi / 2))
+    clear_ways(surface.state, surface.low_mm, surface.cell_mm, places_mm, normals, directions, least, found)
+    return OpenSky(directions, found)
+
+
+def both_see(
+    surface: KnownSurface, places_mm: Float64Array, normals: Float64Array, sights: Sights, asked: BoolArray
+) -> tuple[BoolArray, BoolArray]:
+    """(n,) whether the laser reaches each place, and whether the camera sees it; False where not `asked`."""
+    laser, camera = np.zeros(len(places_mm), dtype=np.bool_), np.zeros(len(places_mm), dtype=np.bool_)
+    grid = (surface.state, surface.low_mm, surface.cell_mm)
+    clear_sights(*grid, places_mm, normals, sights.laser_mm, asked, laser)
+    clear_sights(*grid, places_mm, normals, sights.camera_mm, asked & laser, camera)
+    return laser, camera

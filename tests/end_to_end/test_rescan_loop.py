@@ -1,0 +1,50 @@
+"""The closed loop for real: simulator process, pty, service, and `scanner rescan --auto` beside it."""
+
+import json
+import subprocess
+import sys
+
+from tests.end_to_end.running import ROOT
+
+
+def rescan(service, session_id, *arguments):
+    command = [sys.executable, "-m", "scanner_service", "rescan", session_id, *arguments, "--json"]
+    return subprocess.run(
+        [*command, "--data", str(service.data), "--url", service.url],
+        capture_output=True, text=True, cwd=ROOT, timeout=110, check=False,
+    )  # fmt: skip
+
+
+def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(running):
+    service, simulator = running.service(), running.simulator()
+    body = {
+        "name": "coarse",
+        "source": {"kind": "device", "port": simulator.port, "baud_rate": 3_000_000, "line_rate_hz": 100.0,
+                   "line_spacing_mm": 0.8, "start_mm": 0.0, "end_mm": 20.0},
+        "settings": {"density_per_mm2": 16.0},
+    }  # fmt: skip
+    answer = service.client.post("/api/v1/sessions", json=body)
+    session_id = answer.json()["id"]
+    service.start(session_id)
+    before = service.wait_for_state(session_id, "stopped")["coverage"]
+    listed = rescan(service, session_id)
+    assert listed.returncode == 0, listed.stderr
+    assert json.loads(listed.stdout)["passes"][0]["line_spacing_mm"] < 0.8
+    looped = rescan(service, session_id, "--auto", "--max-passes", "3")
+    assert looped.returncode == 0, looped.stderr
+    result = json.loads(looped.stdout)
+    assert result["loop"]["why_ended"]
+    first = result["orders"][0]
+    assert first["status"] == "done", first["message"]
+    assert first["outcome"]["reached_mm2"] > 0.8 * first["outcome"]["promised_mm2"]
+    assert service.status(session_id)["coverage"] > before + 0.5
+    events = service.client.get(f"/api/v1/sessions/{session_id}/events?limit=1000").json()["events"]
+    told = [event["kind"] for event in events]
+    assert told.index("pass_accepted") < told.index("pass_started") < told.index("pass_outcome")
+    assert told[-1] == "loop_ended"
+    refused = service.client.post(f"/api/v1/sessions/{session_id}/recommended-passes/99/accept")
+    assert (refused.status_code, refused.headers["content-type"]) == (404, "application/problem+json")
+    unclear = service.client.put(f"/api/v1/sessions/{session_id}/rig", json={
+        "axis": "free_pose", "scanner": {"laser_mm": [0, 0, 150], "camera_mm": [0, 76, 150], "range_mm": [-30, 30],
+                                         "field_of_view_mm": 50, "points_per_line": 400}})  # fmt: skip
+    assert unclear.status_code == 409 and "reach_mm" in unclear.json()["detail"]

@@ -1,0 +1,135 @@
+"""From a judged map to passes: what they mend when they are carried out, and what is said to be out of reach."""
+
+import numpy as np
+import pytest
+
+from drivers.scanline import Pose
+from scanner_service.rescan.passes.known_surface import know_surface
+from scanner_service.rescan.passes.looks import look_of
+from scanner_service.rescan.passes.marching import FREE, HIDDEN
+from scanner_service.rescan.passes.outcome import reckon
+from scanner_service.rescan.passes.planner import TRIES, Tried, Wishes, plan_passes
+from simulators.parts import plate, sphere, step
+from tests.unit.rescan.passes.posed_scans import (
+    DENSITY,
+    FROM_ABOVE,
+    OPTICS,
+    Bench,
+    free_reach,
+    linear_reach,
+)
+
+WISHES = Wishes(DENSITY, max_passes=3)
+
+
+def carried_out(bench, one):
+    before = bench.judged()
+    bench.scan(one.motion, one.start_mm, one.end_mm, one.line_spacing_mm)
+    return reckon(one, *before, *bench.judged())
+
+
+def test_a_plate_scanned_too_coarsely_is_mended_by_one_finer_pass_of_its_own_axis():
+    bench = Bench(plate().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.7)
+    plan = plan_passes(*bench.judged(), linear_reach(), OPTICS, WISHES)
+    first = plan.passes[0]
+    assert first.start_mm >= -2.0 and first.end_mm <= 62.0
+    assert first.line_spacing_mm < 0.4
+    outcome = carried_out(bench, first)
+    assert outcome.reached_mm2 == pytest.approx(outcome.promised_mm2, rel=0.15)
+    assert outcome.reached_mm2 > 0.9 * 40.0 * 40.0
+
+
+def test_a_plate_scanned_well_needs_nothing():
+    bench = Bench(plate().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.25)
+    plan = plan_passes(*bench.judged(), linear_reach(), OPTICS, WISHES)
+    assert sum(one.gain_mm2 for one in plan.passes) < 0.02 * 1600.0
+
+
+def test_the_shadow_of_a_step_is_seen_from_another_side():
+    bench = Bench(step().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.25)
+    snapshot, report = bench.judged()
+    assert any(region.reason.label == "shadow" for region in report.regions)
+    plan = plan_passes(snapshot, report, free_reach(), OPTICS, WISHES)
+    towards = plan.passes[0].start_pose.rotation[:, 2]
+    assert towards @ np.array([0.0, -1.0, 1.0]) > 0.7  # from before the step, where its wall is seen
+    gained = sum(carried_out(bench, one).reached_mm2 for one in plan.passes)
+    assert gained > 150.0  # the wall alone has 40 mm x 5 mm
+
+
+def test_passes_are_told_in_plain_numbers_the_best_for_its_time_first():
+    bench = Bench(step().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.7)
+    plan = plan_passes(*bench.judged(), free_reach(), OPTICS, WISHES)
+    assert len(plan.passes) == 3
+    told = plan.to_dict()
+    assert [one["number"] for one in told["passes"]] == [1, 2, 3]
+    for one in plan.passes:
+        assert one.gain_mm2 > 0 and one.duration_s > 0
+        assert sum(promise.gain_mm2 for promise in one.promises) == pytest.approx(float(one.place_mm2.sum()))
+        assert all(promise.density_per_mm2 >= DENSITY for promise in one.promises)
+        assert all(promise.largest_incidence_rad <= OPTICS.max_incidence_rad + 1e-9 for promise in one.promises)
+        assert one.line_count == len(np.arange(one.start_mm, one.end_mm + 1e-9, one.line_spacing_mm))
+
+
+def test_no_place_is_promised_twice():
+    bench = Bench(step().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.7)
+    plan = plan_passes(*bench.judged(), free_reach(), OPTICS, Wishes(DENSITY, max_passes=5))
+    places = np.concatenate([one.places_mm for one in plan.passes])
+    assert len(np.unique(places, axis=0)) == len(places)
+
+
+def test_what_a_fixed_axis_cannot_see_is_unreachable_and_turning_the_part_helps():
+    bench = Bench(step().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.25)
+    fixed = plan_passes(*bench.judged(), linear_reach(), OPTICS, WISHES)
+    turned = plan_passes(*bench.judged(), linear_reach(part_may_turn=True), OPTICS, WISHES)
+    assert sum(one.area_mm2 for one in fixed.unreachable) > sum(one.area_mm2 for one in turned.unreachable)
+    assert all(one.why for one in fixed.unreachable)
+    assert any(one.turn is not None and not one.turn.is_none for one in turned.passes)
+    assert any(one["turn_part"] for one in turned.to_dict()["passes"])
+
+
+def test_what_was_promised_in_vain_is_given_up_so_that_a_loop_ends():
+    bench = Bench(sphere().surface).scan(FROM_ABOVE, 2.0, 28.0, 0.3)
+    judged = bench.judged()
+    tried = Tried.nothing()
+    promised = []
+    for _ in range(TRIES + 2):
+        plan = plan_passes(*judged, linear_reach(), OPTICS, Wishes(DENSITY, max_passes=1), None, tried)
+        promised.append(plan.promised_mm2)
+        if not plan.passes:
+            break
+        tried = tried.and_also(plan.passes[0].places_mm)
+    assert promised[-1] < promised[0] or promised[0] == 0.0
+
+
+def test_the_same_map_gives_the_same_plan():
+    bench = Bench(step().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.7)
+    plans = [plan_passes(*bench.judged(), free_reach(), OPTICS, WISHES).to_dict() for _ in range(2)]
+    assert plans[0] == plans[1]
+
+
+def test_an_empty_map_has_no_passes():
+    bench = Bench(plate().surface).scan(FROM_ABOVE, 200.0, 201.0, 0.5)
+    plan = plan_passes(*bench.judged(), free_reach(), OPTICS, WISHES)
+    assert (plan.passes, plan.needed_mm2) == ((), 0.0)
+
+
+def test_hidden_space_into_which_a_pass_looked_in_vain_is_free():
+    bench = Bench(plate().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.4)
+    a = np.radians(45.0)
+    turn = np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+    side = type(FROM_ABOVE)(Pose(turn, np.zeros(3)), np.array([0.0, 1.0, 0.0]))
+    bench.scan(side, -1.0, 41.0, 0.4)  # from +x: beyond the far edge it hides what the first pass saw through
+    snapshot, _ = bench.judged()
+    none = np.zeros(len(snapshot), dtype=bool)
+    blind = know_surface(snapshot, none, none.astype(np.int32))
+    looks = tuple(
+        look_of(snapshot, number, motion, -1.0, 41.0, OPTICS.rays) for number, motion in ((0, FROM_ABOVE), (1, side))
+    )
+    seeing = know_surface(snapshot, none, none.astype(np.int32), None, looks, OPTICS)
+    freed = (blind.state == HIDDEN) & (seeing.state == FREE)
+    assert freed.any()
+    cells = seeing.low_mm + (np.argwhere(freed) + 0.5) * seeing.cell_mm
+    inside = (
+        (np.abs(cells[:, 0]) < 19.0) & (cells[:, 1] > 1) & (cells[:, 1] < 39) & (cells[:, 2] > -5) & (cells[:, 2] < -1)
+    )
+    assert inside.mean() < 0.02  # the inside of the plate is not emptied

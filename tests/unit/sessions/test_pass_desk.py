@@ -1,0 +1,112 @@
+"""Recommended passes in a session: accepted, scanned by hand, reckoned up, and refused where they make no sense."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from scanner_service.rescan.passes.errors import RigUnlimited
+from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.errors import PassUnknown, SessionBusy
+from scanner_service.sessions.pass_desk import LoopLimits, PassStatus, RigSetup
+from scanner_service.sessions.settings import SessionSettings
+from scanner_service.sessions.source_specs import PushSpec
+from scanner_service.storage.record import Record
+from simulators.parts import step
+from simulators.posed_rig import PosedScanner
+from tests.unit.rescan.passes.posed_scans import DENSITY, FROM_ABOVE, OPTICS, SCANNER, free_reach, linear_reach
+
+
+@pytest.fixture
+def book(tmp_path):
+    with Record.open(tmp_path / "record.sqlite") as record:
+        book = SessionBook(record)
+        yield book
+        book.close()
+
+
+@pytest.fixture
+def scanned(book):
+    """A step scanned too coarsely by a client, and the scanner in its hand."""
+    session = book.create("step", PushSpec(), SessionSettings(density_per_mm2=DENSITY, max_points=400_000))
+    posed = PosedScanner(SCANNER, step().surface, np.random.default_rng(1))
+    session.start()
+    push(session, posed, FROM_ABOVE, -1.0, 41.0, 0.6)
+    session.stop()
+    return session, posed
+
+
+def push(session, posed, motion, start_mm, end_mm, spacing_mm):
+    replies = [session.push(line) for line in posed.scan(motion.part_from_sensor, start_mm, end_mm, spacing_mm)]
+    for reply in replies:
+        reply.result(30)
+
+
+def kinds(book, session):
+    return [event.kind for event in book.record.events(session.row.session_id)]
+
+
+def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
+    session, posed = scanned
+    desk = book.pass_desk(session)
+    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    plan = desk.plan()
+    order = desk.accept(plan.passes[0].number)
+    assert order.status is PassStatus.ACCEPTED
+    desk.carry_out(order.order_id)
+    assert session.state == "scanning"
+    one = order.planned
+    push(session, posed, one.motion, one.start_mm, one.end_mm, one.line_spacing_mm)
+    guidance = desk.guidance(order.order_id)
+    assert guidance.aside_mm < 0.5 and guidance.along_mm < 1.0
+    session.stop()
+    desk._wait_for(order)
+    assert order.status is PassStatus.DONE
+    assert order.outcome.promised_mm2 == pytest.approx(one.gain_mm2)
+    assert order.outcome.reached_mm2 > 0.7 * order.outcome.promised_mm2
+    assert desk.plan().version > plan.version
+    assert desk.plan().needed_mm2 < plan.needed_mm2
+    for _ in range(100):
+        if "pass_outcome" in kinds(book, session):
+            break
+        desk._wait_for(order)
+    told = [kind for kind in kinds(book, session) if kind.startswith("pass_")]
+    assert told == ["pass_accepted", "pass_started", "pass_outcome"]
+
+
+def test_without_limits_of_the_rig_nothing_is_planned(book, scanned):
+    with pytest.raises(RigUnlimited, match="state its limits"):
+        book.pass_desk(scanned[0]).plan()
+
+
+def test_what_is_not_in_the_plan_is_refused(book, scanned):
+    desk = book.pass_desk(scanned[0])
+    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    with pytest.raises(PassUnknown, match="no pass 99"):
+        desk.accept(99)
+    with pytest.raises(PassUnknown, match="no pass order 1"):
+        desk.carry_out(1)
+
+
+def test_a_part_that_must_be_turned_waits_for_its_operator(book, scanned):
+    session, _ = scanned
+    desk = book.pass_desk(session)
+    reach = dataclasses.replace(linear_reach(part_may_turn=True), turn_part_s=0.1)
+    desk.describe_rig(RigSetup(reach, OPTICS))
+    turned = next(one for one in desk.plan().passes if one.turn is not None and not one.turn.is_none)
+    order = desk.accept(turned.number)
+    with pytest.raises(SessionBusy, match="part"):
+        desk.carry_out(order.order_id)
+    desk.carry_out(order.order_id, part_is_turned=True)
+    assert order.status is PassStatus.RUNNING
+    with pytest.raises(SessionBusy, match="running"):
+        desk.carry_out(order.order_id, part_is_turned=True)
+    session.stop()
+    desk._wait_for(order)
+
+
+def test_a_hand_cannot_be_looped(book, scanned):
+    desk = book.pass_desk(scanned[0])
+    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    with pytest.raises(SessionBusy, match="by hand"):
+        desk.run_loop(LoopLimits())
