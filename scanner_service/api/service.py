@@ -62,7 +62,7 @@ class Service:
         replay_dir.mkdir(exist_ok=True)
         record = Record.open(record_at or data_dir / "record.sqlite", limits=limits)
         try:
-            book = SessionBook(record, replay_dir, retention)
+            book = SessionBook(record, retention, meshes=replay_dir)
             access = Access.open(data_dir, time.monotonic, secrets.token_bytes)
             exports = ExportDesk(
                 data_dir / "exports", lambda: RecordReader.open(record_at or data_dir / "record.sqlite")

@@ -48,9 +48,9 @@ class SessionBook:
     def __init__(
         self,
         record: Record,
-        meshes: Path | None = None,
         retention: Retention | None = None,
         clock: Callable[[], datetime] = utc_now,
+        meshes: Path | None = None,
     ) -> None:
         self.record = record
         self._meshes = meshes  # the folder in which reference meshes lie
