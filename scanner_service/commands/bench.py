@@ -69,6 +69,21 @@ def orientation_command(
     _run([*command, "--without-peers"] if without_peers else command)
 
 
+@bench_app.command("latency")
+def latency_command(
+    json_file: Annotated[Path | None, typer.Option("--json", help="File for the figures.")] = None,
+    rates: Annotated[list[float] | None, typer.Option("--rate", help="Lines a second; repeat it for more.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Length of the run at each rate.")] = 4.0,
+) -> None:
+    """Measure from a line's last byte on the serial port to the update that a client receives; save JSON."""
+    command = ["benchmarks.latency", "--seconds", str(seconds)]
+    if rates:
+        command += ["--rates", *map(str, rates)]
+    if json_file is not None:
+        command += ["--json", str(json_file.absolute())]
+    _run(command)
+
+
 def _run(command: list[str]) -> None:
     """Run a module of the benchmarks from the checkout; its status is ours."""
     root = project_root()
