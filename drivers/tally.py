@@ -341,7 +341,10 @@ class BootLedger:
 
     def _account(self, pass_index: int) -> _PassAccount:
         """The account of a pass; a device that tells of more passes than it can have run does not fill the memory."""
-        if pass_index not in self._passes and len(self._passes) >= _MAX_PASSES:
+        account = self._passes.get(pass_index)
+        if account is not None:  # so for every chunk but a pass' first: an account is not made to be thrown away
+            return account
+        if len(self._passes) >= _MAX_PASSES:
             pass_index = OTHER_PASSES
         return self._passes.setdefault(pass_index, _PassAccount())
 

@@ -28,7 +28,8 @@ class OpenLine:
         self.arrival_s = arrival_s
         self.n_chunks = 0
         self._points = np.full((chunk.points_in_line, 2), NO_RETURN, dtype=np.int32)
-        self._missing = np.ones(chunk.points_in_line, dtype=np.bool_)
+        self._missing_flags = bytearray(b"\1") * chunk.points_in_line  # the array below, as bytes
+        self._missing = np.frombuffer(self._missing_flags, dtype=np.bool_)
         self._n_missing = chunk.points_in_line
 
     @property
@@ -42,7 +43,7 @@ class OpenLine:
         if (
             chunk.pass_index != self.header.pass_index
             or chunk.points_in_line != len(self._missing)
-            or not self._missing[place].all()
+            or 0 in self._missing_flags[place]
         ):
             return False
         self._points[place] = chunk.points
@@ -55,7 +56,8 @@ class OpenLine:
         """Return what has arrived, in millimetres; points without a return, and missing ones, are NaN."""
         header = self.header
         xz_mm = self._points / TENTH_UM_PER_MM
-        xz_mm[(self._points == NO_RETURN).any(axis=1)] = np.nan
+        no_return = self._points == NO_RETURN
+        xz_mm[no_return[:, 0] | no_return[:, 1]] = np.nan
         return Profile(
             device_id=info.device_id,
             boot_id=header.boot_id,

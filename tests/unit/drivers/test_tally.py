@@ -12,7 +12,7 @@ from drivers.protocols.native_messages import Chunk, EndReason, Hello, PositionK
 from drivers.protocols.native_stream import ProfileStream
 from drivers.protocols.unwrap import increase_u32, unwrap_u32
 from drivers.scanline import DeviceInfo, Profile, SensorGeometry
-from drivers.tally import BootLedger, Kind, PassTally, Tally
+from drivers.tally import OTHER_PASSES, BootLedger, Kind, PassTally, Tally
 
 U32 = 2**32
 GEOMETRY = SensorGeometry(np.zeros(3), np.zeros(3), (-1.0, 1.0), 0.001)
@@ -274,6 +274,29 @@ def test_a_chunk_that_contradicts_its_line_is_lost_as_a_conflict() -> None:
         )
     assert stream.tally().chunks.lost == {"conflict": 1}
     assert stream.tally().chunks.balances
+
+
+def test_a_chunk_that_overlaps_another_in_part_is_a_conflict_and_nothing_of_it_is_taken() -> None:
+    profiles: list[Profile] = []
+    stream = ProfileStream(hello(1, status(1, 0, 0, 0, 0)), lambda profile: profiles.append(profile) or True)
+    for number, (first, values) in enumerate([(0, [10, 20]), (1, [70, 80]), (2, [30])]):
+        points = np.array([[value, value] for value in values], dtype=np.int32)
+        stream.chunk(Chunk(1, number, 1, 0, 0, PositionKind.NONE, 0, (0, 0, 0), 1, 1, 0, 0, 3, first, points), 0.0)
+    (profile,) = profiles
+    np.testing.assert_array_equal(profile.x_mm, [0.001, 0.002, 0.003])
+    assert profile.is_whole
+    assert stream.tally().chunks.lost == {"conflict": 1}
+
+
+def test_a_known_pass_keeps_its_account_when_there_is_no_room_for_new_ones() -> None:
+    ledger = BootLedger(boot_id=9)
+    for number in range(1_030):
+        ledger.chunk(number, number, 0, 0, number)
+    ledger.chunk(1_030, 1_030, 0, 0, 5)
+    tally = ledger.tally()
+    assert tally.passes[9, 5].chunks.sent == 2
+    assert tally.passes[9, OTHER_PASSES].chunks.sent == 6
+    assert tally.chunks.sent == 1_031
 
 
 def test_tallies_of_boots_add_up_and_are_json() -> None:
