@@ -54,6 +54,12 @@ class StoredLine:
             read_only(array)
 
 
+def _in_all_columns(is_so: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """(n,) True where all three columns of (n, 3) are: `all(axis=1)`, whose loop over short rows costs five times."""
+    x, y, z = is_so.T
+    return np.asarray(x & y & z)
+
+
 def quantise(line: Scanline, origin_mm: Float64Array) -> StoredLine:
     """Quantise a scanline to the stored truth; nothing is clamped, what cannot be kept is counted by reason.
 
@@ -77,11 +83,11 @@ def quantise(line: Scanline, origin_mm: Float64Array) -> StoredLine:
             f"not {line.laser_mm.tolist()}"
         )
     points = line.points_mm
-    is_nan = np.isnan(points).all(axis=1)
-    finite = np.isfinite(points).all(axis=1) & ~line.missing
+    is_nan = _in_all_columns(np.isnan(points))
+    finite = _in_all_columns(np.isfinite(points)) & ~line.missing
     with np.errstate(invalid="ignore", over="ignore"):
         scaled = np.rint((points - origin_mm) / QUANTUM_MM)
-        inside = (np.abs(scaled) <= _LIMIT_Q).all(axis=1)
+        inside = _in_all_columns(np.abs(scaled) <= _LIMIT_Q)
     kept = finite & inside
     dropped = {
         "dropout": int((is_nan & ~line.missing).sum()),
