@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import time
 from typing import Any
 
 from fastapi import APIRouter, Depends, WebSocket
@@ -153,6 +154,7 @@ async def _send_points(websocket: WebSocket, session: LiveSession, credit: _Cred
     await greeted.wait()
     while True:
         await credit.granted.wait()
+        asked_s = time.monotonic()
         is_final = _is_final(session)  # looked at before the question: its answer is the last word then
         changes = await asyncio.wrap_future(session.changes_since(version))
         if len(changes) == 0 and has_sent:
@@ -168,7 +170,12 @@ async def _send_points(websocket: WebSocket, session: LiveSession, credit: _Cred
             await websocket.send_bytes(message)
         has_sent = True
         version = changes.version
-        await asyncio.sleep(UPDATE_PERIOD_S)
+        await asyncio.sleep(rest_s(asked_s, time.monotonic()))
+
+
+def rest_s(asked_s: float, now_s: float) -> float:
+    """How long to wait before the next update: what the last one took is part of its period; 0 when it took longer."""
+    return max(0.0, asked_s + UPDATE_PERIOD_S - now_s)
 
 
 async def _send_status(websocket: WebSocket, session: LiveSession, greeted: asyncio.Event) -> None:
