@@ -4,9 +4,11 @@ Knows the map, the record and the ledger; knows no device, no file and no client
 asks the engine, which answers between two scanlines.
 """
 
+import contextlib
 import logging
 import queue
 import threading
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -41,8 +43,15 @@ class _Ask:
     reply: "Future[object]"
 
 
+class _Look:
+    """Wakes an engine that has nothing to do: somebody asks between two scanlines."""
+
+
 class Engine:
-    """Owns the live map; everything goes through `inbox`, in the order in which it was put there."""
+    """Owns the live map; everything goes through `inbox`, in the order in which it was put there.
+
+    Only what is asked by `ask_between` does not wait for its turn: it is answered after the scanline under way.
+    """
 
     def __init__(
         self,
@@ -58,7 +67,8 @@ class Engine:
         self._record = record
         self._seen: set[tuple[str, int, int]] = set()
         self._open: dict[str, PassKey] = {}
-        self._inbox: queue.Queue[_Line | _Ask | None] = queue.Queue(INBOX_LINES)
+        self._inbox: queue.Queue[_Line | _Ask | _Look | None] = queue.Queue(INBOX_LINES)
+        self._between: deque[_Ask] = deque()
         self._ended = threading.Event()  # set before the inbox is emptied for the last time: see `_hand_over`
         self._thread = threading.Thread(target=self._run, name=f"engine-{session_id}", daemon=True)
 
@@ -88,6 +98,22 @@ class Engine:
         reply: Future[T] = Future()
         if not self._hand_over(_Ask(question, reply)):  # type: ignore[arg-type]
             reply.set_exception(SessionNotLive(self.failure or "the session is closed"))
+        return reply
+
+    def ask_between(self, question: "Callable[[Engine], T]") -> "Future[T]":
+        """Have a question answered before the next scanline, whatever waits in the inbox; never waits itself.
+
+        It is for whoever shows the map as it is now: behind a full inbox every answer would be seconds old.
+        """
+        reply: Future[T] = Future()
+        if not self._thread.is_alive() or self._ended.is_set():
+            reply.set_exception(SessionNotLive(self.failure or "the session is closed"))
+            return reply
+        self._between.append(_Ask(question, reply))  # type: ignore[arg-type]
+        with contextlib.suppress(queue.Full):  # an engine with a full inbox is awake, and looks before each message
+            self._inbox.put_nowait(_Look())
+        if self._ended.is_set():
+            self._refuse_the_rest()
         return reply
 
     def _hand_over(self, message: "_Line | _Ask | None") -> bool:
@@ -124,12 +150,14 @@ class Engine:
     def _run(self) -> None:
         while True:
             message = self._inbox.get()
-            if message is None:
-                break
             try:
+                for _ in range(len(self._between)):
+                    self._answer(self._between.popleft())
+                if message is None:
+                    break
                 if isinstance(message, _Line):
                     self._take(message)
-                else:
+                elif isinstance(message, _Ask):
                     self._answer(message)
             except Exception as error:  # noqa: BLE001 - the thread's loop: told to everybody who asks
                 _LOG.exception("the engine of session %s stopped", self.session_id)
@@ -209,8 +237,8 @@ class Engine:
         """What reached the inbox too late is told so."""
         while True:
             try:
-                message = self._inbox.get_nowait()
-            except queue.Empty:
+                message = self._between.popleft() if self._between else self._inbox.get_nowait()
+            except (IndexError, queue.Empty):  # or another thread was faster, which then refuses what is left
                 return
             if isinstance(message, _Line):
                 self._refuse(message, "too_late", self.failure or "the session was closed before the line's turn came")

@@ -346,12 +346,12 @@ class LiveSession:
     # -- what a reader asks -------------------------------------------------------------------------------------
 
     def changes_since(self, version: int) -> "Future[Changes]":
-        """Which points changed after `version` of the map; 0 asks for all."""
-        return self.engine.ask(lambda engine: changes_since(engine.live_map, version))
+        """Which points changed after `version` of the map as it is now; 0 asks for all."""
+        return self.engine.ask_between(lambda engine: changes_since(engine.live_map, version))
 
     def read_page(self, changes: Changes, start: int, count: int) -> "Future[PointPage]":
         """What is said of the changed points from number `start` on, at most `count` of them."""
-        return self.engine.ask(lambda engine: read_page(engine.live_map, self.verdicts, changes, start, count))
+        return self.engine.ask_between(lambda engine: read_page(engine.live_map, self.verdicts, changes, start, count))
 
     def latest_lines(self) -> list[tuple[Scanline, float]]:
         """The last few scanlines with the seconds at which they came, the oldest first."""

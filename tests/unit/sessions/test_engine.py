@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scanner_service.analysis.live_map import MapSettings
-from scanner_service.sessions.engine import Engine
+from scanner_service.sessions.engine import INBOX_LINES, Engine
 from scanner_service.sessions.errors import SessionNotLive
 from scanner_service.storage.record import Record
 from tests.unit.analysis.scans import surface_scan
@@ -58,7 +58,8 @@ def test_everybody_is_answered_when_the_engine_closes_in_the_middle(engine):
 
     def ask_much():
         barrier.wait(10)
-        answers.extend([engine.ask(lambda engine: engine.live_map.version) for _ in range(500)])
+        answers.extend([engine.ask(lambda engine: engine.live_map.version) for _ in range(250)])
+        answers.extend([engine.ask_between(lambda engine: engine.live_map.version) for _ in range(250)])
 
     threads = [threading.Thread(target=ask_much) for _ in range(8)]
     for thread in threads:
@@ -94,3 +95,32 @@ def test_a_pushed_line_in_the_inbox_cannot_be_called_back(engine):
     engine.put(LINES[0], reply)
     assert not reply.cancel()
     assert reply.result(10).outcome == "stored"
+
+
+def test_what_is_asked_between_lines_does_not_wait_behind_a_full_inbox(engine):
+    engine.start()
+    held, go_on = threading.Event(), threading.Event()
+
+    def hold(_engine):
+        held.set()
+        go_on.wait(30)
+
+    engine.ask(hold)
+    assert held.wait(30)
+    for line in LINES:
+        engine.put(line)
+    in_turn = engine.ask(lambda engine: len(engine.live_map))
+    for _ in range(INBOX_LINES - len(LINES) - 1):
+        engine.ask(lambda engine: None)
+    now = engine.ask_between(lambda engine: len(engine.live_map))  # returns though there is no room for a message
+    go_on.set()
+    assert now.result(30) == 0
+    assert in_turn.result(30) == sum(len(line.index) for line in LINES)
+
+
+def test_what_is_asked_between_lines_wakes_an_idle_engine_and_is_refused_by_one_that_ended(engine):
+    engine.start()
+    assert engine.ask_between(lambda engine: len(engine.live_map)).result(30) == 0
+    engine.close()
+    with pytest.raises(SessionNotLive):
+        engine.ask_between(lambda engine: len(engine.live_map)).result(30)
