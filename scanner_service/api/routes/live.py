@@ -174,8 +174,13 @@ async def _send_points(websocket: WebSocket, session: LiveSession, credit: _Cred
 
 
 def rest_s(asked_s: float, now_s: float) -> float:
-    """How long to wait before the next update: what the last one took is part of its period; 0 when it took longer."""
-    return max(0.0, asked_s + UPDATE_PERIOD_S - now_s)
+    """How long to wait before the next update: what the last one took is part of its period.
+
+    One that took long is followed by a rest as long as itself, a whole period at the most, so that a client in a hurry
+    does not take the time in which lines are read.
+    """
+    took_s = now_s - asked_s
+    return max(UPDATE_PERIOD_S - took_s, min(took_s, UPDATE_PERIOD_S))
 
 
 async def _send_status(websocket: WebSocket, session: LiveSession, greeted: asyncio.Event) -> None:
