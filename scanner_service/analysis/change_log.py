@@ -1,6 +1,7 @@
 """Which rows changed in which version of a map, as far back as is kept; knows no points."""
 
 from collections import deque
+from itertools import takewhile
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class ChangeLog:
             return np.empty(0, dtype=np.int32)
         if not self._versions or self._versions[0][0] > version + 1:
             return None
-        newer = [rows for at, rows in self._versions if at > version]
+        newer = [rows for _, rows in takewhile(lambda kept: kept[0] > version, reversed(self._versions))]
         return np.sort(newer[0]) if len(newer) == 1 else _union(newer)
 
 
