@@ -111,6 +111,7 @@ def _store(points, row, sums, fits, i, reason, radius_mm, step, passes, other_si
     nx, ny, nz = np.float32(ax), np.float32(ay), np.float32(az)
     to_mm2 = QUANTUM_MM * QUANTUM_MM
     middle = np.float32(fits[4, i] * to_mm2)
+    smallest = np.float32(fits[5, i] * to_mm2)
     offset = np.float32(fits[7, i] * to_mm2 / (radius_mm * radius_mm))
     same = (
         points[row].changed_at > 0
@@ -121,6 +122,7 @@ def _store(points, row, sums, fits, i, reason, radius_mm, step, passes, other_si
         and points[row].open_passes == passes
         and points[row].middle_mm2 == middle
         and points[row].offset_sq == offset
+        and points[row].smallest_mm2 == smallest
         and (reason != 0 or (points[row].nx == nx and points[row].ny == ny and points[row].nz == nz))
     )
     if same:
@@ -132,7 +134,7 @@ def _store(points, row, sums, fits, i, reason, radius_mm, step, passes, other_si
     points[row].open_passes = passes
     points[row].nx, points[row].ny, points[row].nz = nx, ny, nz
     points[row].middle_mm2 = middle
-    points[row].smallest_mm2 = fits[5, i] * to_mm2
+    points[row].smallest_mm2 = smallest
     points[row].offset_sq = offset
     points[row].changed_at = version
     return True

@@ -60,6 +60,9 @@ FILLED, FRESH, NEXT_TO, FAR, DOUBLED = 0, 1, 2, 3, 6
 FIRST, LAST, COUNT, OLD = range(4)
 
 
+_LONGEST_LINE = 4096
+"""Before a line is taken there must be a block for each of its points."""
+
 CROWDED = 64
 """A cell with so many entries looks for the same point before it takes another."""
 
@@ -71,7 +74,7 @@ def cell_side_q(radius_mm: float, quantum_mm: float) -> int:
 
 def reserve_grid(side_q: int, max_points: int) -> Grid:
     """An empty grid with room for `max_points` points in cells of `side_q` quanta."""
-    blocks = max(1024, max_points // 8)
+    blocks = max_points // 8 + min(max_points, _LONGEST_LINE)
     return Grid(
         side_q=np.array([side_q], dtype=np.int64),
         used=np.zeros(6, dtype=np.int64),

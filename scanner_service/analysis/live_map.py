@@ -90,7 +90,8 @@ class Accepted:
     """What became of one line: its row in the line table, its radius, and how many of its points count.
 
     `left_out` counts points that are kept in the record but not in the map, by reason: `stationary`,
-    `over_dense`, `withdrawn` (a line of a pass that was taken out before).
+    `over_dense`, `withdrawn` (a line of a pass that was taken out before). A line whose radius needs larger cells can
+    leave out points of earlier lines: `counted` is then that much less, and may be negative, so that sums stay true.
     """
 
     line_row: int
@@ -194,13 +195,14 @@ class LiveMap:
             return Accepted(row, common, 0, {passed_over: last - first} if last > first else {})
         if of.slot >= 0:
             self._follow(of, line)
+        over_dense = 0
         if self._rules.is_flexible or self._global is not None:
-            self._reach_at_least(self._rules.max_radius_mm / GROWTH_REACH)  # a search reaches that many cells
+            over_dense = self._reach_at_least(self._rules.max_radius_mm / GROWTH_REACH)  # what a search spans
         if not self._rules.is_flexible:
-            self._reach_at_least(common)
-        over_dense = self._insert(row, first, last)
+            over_dense += self._reach_at_least(common)
+        over_dense += self._insert(row, first, last)
         if self._global is not None and self._global.wants_estimate(line, first, last):
-            self._estimate_global()
+            over_dense += self._estimate_global()
         return Accepted(row, common, last - first - over_dense, {"over_dense": over_dense} if over_dense else {})
 
     def close_pass(self, key: PassKey) -> None:
@@ -263,25 +265,30 @@ class LiveMap:
             self._first_new = 0
         self._passes.publish(of, self.origin_mm)
 
-    def _reach_at_least(self, radius_mm: float) -> None:
-        """Make the cells at least as large as the largest radius, building the grid again when they are not."""
+    def _reach_at_least(self, radius_mm: float) -> int:
+        """Make the cells at least as large as the largest radius, building the grid again when they are not.
+
+        Returns how many points that left out.
+        """
         if radius_mm <= self._largest_radius_mm:
-            return
+            return 0
         if cell_side_q(radius_mm, QUANTUM_MM) <= self._grid.side_q[0]:
             self._largest_radius_mm = radius_mm
-            return
+            return 0
         # Radii that creep up line by line must not build the grid anew each time.
         side_mm = radius_mm if self._largest_radius_mm == 0.0 else 1.25 * radius_mm
         self._largest_radius_mm = radius_mm
-        self._build_grid(cell_side_q(side_mm, QUANTUM_MM))
+        return self._build_grid(cell_side_q(side_mm, QUANTUM_MM))
 
-    def _build_grid(self, side_q: int) -> None:
-        """Build the grid anew with cells of this side; every point is evaluated again with the next reading."""
+    def _build_grid(self, side_q: int) -> int:
+        """Build the grid anew with cells of this side; every point is evaluated again with the next reading.
+
+        Returns how many points larger cells had to leave out.
+        """
         self._grid = reserve_grid(side_q, self.settings.max_points)
         self._first_new = 0
         rows, self._grid_rows = self._grid_rows, 0
-        for line, first, last in self._lines.ranges(rows):
-            self._insert(line, first, last)
+        return sum(self._insert(line, first, last) for line, first, last in self._lines.ranges(rows))
 
     def _insert(self, line: int, first: int, last: int) -> int:
         """Put the rows of a line into the grid; returns how many a full cell had to leave out."""
@@ -299,24 +306,27 @@ class LiveMap:
             self._leave_out(first + np.flatnonzero((counted == 0) & (said != NOT_COUNTED)))
         return left_out
 
-    def _estimate_global(self) -> None:
-        """Take the median of the sample's flexible radii as the radius of the whole cloud, and re-key the map by it."""
+    def _estimate_global(self) -> int:
+        """Take the median of the sample's flexible radii as the radius of the whole cloud, and re-key the map by it.
+
+        Returns how many points that left out.
+        """
         if self._global is None:
-            return
+            return 0
         rows = self._global.sample()
         rows = rows[self._points["unreliable"][rows] != NOT_COUNTED]
         radii = np.empty(len(rows))
         flexible_radii_mm(rows, self._grid, self._points, self._rules, self._scratch[0], radii)
         radius_mm = self._global.settle_on(radii, self._used)
         if radius_mm is None:
-            return
+            return 0
         self._points["radius_mm"][: self._used] = radius_mm
         self._points["rule"][: self._used] = RadiusRule.GLOBAL
         self._points["changed_at"][: self._used] = 0  # another radius is another answer, whatever it counts
         self._lines.set_clearance(float(radius_limit_mm(radius_mm, self._rules)))
         self._largest_radius_mm = radius_mm
         side_mm = max(radius_mm, self._rules.max_radius_mm / GROWTH_REACH)
-        self._build_grid(cell_side_q(side_mm, QUANTUM_MM))
+        return self._build_grid(cell_side_q(side_mm, QUANTUM_MM))
 
     def _leave_out(self, rows: npt.NDArray[np.int64]) -> None:
         """Keep rows without counting them, and without an answer."""

@@ -39,7 +39,7 @@ def export_command(
     """Write a session in other programs' formats, with a manifest of hashes; PLY when no format is named."""
     with plain_errors():
         wanted = [part for given in formats or ["ply"] for part in given.lower().split(",")]
-        wanted = list(FORMATS) if wanted == ["all"] else wanted
+        wanted = list(FORMATS) if "all" in wanted else wanted
         check_formats(wanted)
         check_folder(out)
         with open_reader(data, record) as reader, work_progress("exporting", as_json) as progress:

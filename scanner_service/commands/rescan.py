@@ -131,7 +131,7 @@ def _tell_plan(plan: dict[str, Any]) -> None:
 
 def _tell_orders(orders: list[dict[str, Any]]) -> None:
     for order in orders:
-        console.print(f"pass {order['order']}: {_said(order)}", highlight=False, soft_wrap=True)
+        console.print(f"order {order['order']}: {_said(order)}", highlight=False, soft_wrap=True)
 
 
 def _ask(response: httpx.Response) -> Any:

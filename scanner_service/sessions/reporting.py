@@ -1,7 +1,7 @@
 """What the report of a session says: gathers it from the rebuilt session; draws and lays out nothing."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from typing import Any
 
@@ -54,7 +54,7 @@ def report_of(stored: StoredSession, now: datetime) -> ReportContent:
         ),
         facts=_facts(summary),
         losses=_losses(stored.losses),
-        settings=tuple(_setting(name, value) for name, value in stored.row.settings.items()),
+        settings=tuple(_settings(stored.row.settings)),
         damaged=stored.damaged,
     )
 
@@ -128,6 +128,15 @@ def _in_order(name: str) -> tuple[int, str]:
     """Accounts are read from what came in to what is missing."""
     order = ("received", "places", "sent", "stored", "counted", "pending", "duplicates", "conflicts")
     return (order.index(name) if name in order else len(order), name)
+
+
+def _settings(values: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Each setting in a row of its own; of what is asked for, only what is."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _settings({inner: told for inner, told in value.items() if told is not None})
+        else:
+            yield _setting(name, value)
 
 
 def _setting(name: str, value: Any) -> tuple[str, str]:

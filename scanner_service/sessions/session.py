@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from drivers.scanline import Scanline
+from drivers.tally import PassTally
 from scanner_service.analysis.errors import AnalysisError
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey, pass_key
@@ -104,6 +105,8 @@ class LiveSession:
         self._disk = _DiskWatch()
         self._owed: deque[tuple[str, dict[str, Any]]] = deque(maxlen=1000)  # events that a failing disk did not take
         self._closing = threading.Event()
+        self._is_closing = False
+        self._earlier_wire: Mapping[PassKey, PassTally] = {}
         self._analyst = threading.Thread(target=self._analyse, name=f"analyst-{row.session_id}", daemon=True)
 
     @property
@@ -191,6 +194,9 @@ class LiveSession:
                 raise SessionBusy(f"the session is {self._state}: a further pass can be scanned once it is stopped")
             known = self.source
             source = open_source()
+            if self._is_closing:  # meanwhile somebody wanted it closed: nothing is to be switched on any more
+                source.stop()
+                raise SessionBusy("the session is being closed")
             if (
                 source.towards_sensor is None
                 or known.towards_sensor is None
@@ -206,6 +212,8 @@ class LiveSession:
                 self.source, self._state = known, "stopped"
                 source.stop()
                 raise
+            if isinstance(known, OnAWire):
+                self._earlier_wire = _joined(self._earlier_wire, known.pass_tallies())
             self._set_state(self._state)
 
     def push(self, line: Scanline) -> "Future[Stored]":
@@ -298,6 +306,9 @@ class LiveSession:
 
     def close(self) -> None:
         """Let go of everything; a session that is scanning is stopped first."""
+        self._is_closing = True
+        with self._lock:  # a pass that is just being started has started, and is stopped, or never does
+            pass
         try:
             self.stop()
         finally:
@@ -384,9 +395,9 @@ class LiveSession:
         return self._earlier_s + (self._ended_s if self._ended_s is not None else self._clock()) - self._begun_s
 
     def losses(self) -> dict[str, Any]:
-        """The whole ledger: lines, points, each pass, and what the driver counted on the wire."""
+        """The whole ledger: lines, points, each pass, and what the driver of the latest source counted on the wire."""
         source = self.source
-        wire = source.pass_tallies() if isinstance(source, OnAWire) else None
+        wire = _joined(self._earlier_wire, source.pass_tallies() if isinstance(source, OnAWire) else {})
         return self.engine.ledger.to_dict(source.tally(), wire)
 
     def status(self) -> Status:
@@ -587,3 +598,8 @@ class _DiskWatch:
             f"the record cannot be written ({writer.reason}): {writer.waiting_lines} lines wait in memory and "
             f"{writer.refused} were lost; free space on its disk, and it goes on by itself"
         )
+
+
+def _joined(a: Mapping[PassKey, PassTally], b: Mapping[PassKey, PassTally]) -> dict[PassKey, PassTally]:
+    """The accounts of both, those of the same pass added."""
+    return {**a, **{key: a[key] + told if key in a else told for key, told in b.items()}}

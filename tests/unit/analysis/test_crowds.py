@@ -115,3 +115,19 @@ def test_flexible_radii_hold_where_a_wall_is_seen_from_both_sides():
     up = snapshot.points_mm[:, 2] > 0.2
     assert (snapshot.normals[up & snapshot.reliable, 2] > 0).all()
     assert (snapshot.normals[~up & snapshot.reliable, 2] < 0).all()
+
+
+def test_what_larger_cells_leave_out_is_told():
+    rng = np.random.default_rng(2)
+    live = LiveMap(MapSettings(max_points=60_000, cell_limit=300))
+    counted, left_out = 0, 0
+    for line in range(20):
+        points = np.column_stack([np.sort(rng.uniform(0, 8, 1000)), np.full(1000, 0.05 * line), np.zeros(1000)])
+        wide = {"line_spacing_mm": 2.0} if line == 19 else {"line_spacing_mm": 0.05}
+        accepted = live.add(stored(points, line, travel=np.full(3, np.nan), **wide))
+        counted += accepted.counted
+        left_out += accepted.left_out.get("over_dense", 0)
+    snapshot = live.snapshot()
+    assert counted == (snapshot.unreliable != Unreliable.NOT_COUNTED).sum()
+    assert counted + left_out == 20_000
+    assert accepted.counted < 0, "the last line's cells are larger, and hold fewer points than were counted"

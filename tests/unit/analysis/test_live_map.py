@@ -387,15 +387,22 @@ def test_a_laser_that_is_nowhere_near_is_refused():
 
 
 def test_points_scattered_too_widely_are_refused_before_anything_of_the_line_is_taken():
-    live = new_map(max_points=4000, radius=RadiusSettings(point_spacing_mm=0.0))
+    live = new_map(max_points=20_000, radius=RadiusSettings(point_spacing_mm=0.0))
     rng = np.random.default_rng(0)
     taken = 0
     with pytest.raises(MapFull, match="scattered too widely"):
-        for i in range(20):
-            live.add(stored(rng.uniform(-1e5, 1e5, (150, 3)), i, position_mm=float(i)))
-            taken += 150
+        for i in range(12):
+            live.add(stored(rng.uniform(-1e5, 1e5, (1500, 3)), i, position_mm=float(i)))
+            taken += 1500
     assert len(live.snapshot()) == taken
-    assert live.line_count == taken // 150
+    assert live.line_count == taken // 1500
+
+
+def test_a_small_map_takes_lines_up_to_its_ceiling():
+    live = new_map(max_points=10_000)
+    for i in range(7):
+        live.add(stored(np.column_stack([np.arange(1280) * 0.15, np.full(1280, 0.2 * i), np.zeros(1280)]), i))
+    assert len(live) == 7 * 1280
 
 
 def test_quantising_accounts_for_every_place_of_the_line():
