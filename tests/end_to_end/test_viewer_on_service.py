@@ -134,7 +134,7 @@ def test_the_page_says_that_the_scanner_is_gone_and_stops_the_scan_when_it_is_ba
 ) -> None:
     link = tmp_path / "scanner-port"
     service, simulator = running.service(), running.simulator("step", "--link", link)
-    session_id = service.create(**device(simulator, port=str(link), line_rate_hz=20.0))
+    session_id = service.create(**device(simulator, port=str(link), line_rate_hz=20.0, rearm=True))
     service.start(session_id)
     page = viewer_page(context, service)
     page.until("viewer.points > 1000")
