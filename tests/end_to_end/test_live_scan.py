@@ -175,7 +175,9 @@ def test_a_pulled_cable_pauses_the_scan_and_its_return_resumes_it(running, tmp_p
     wire = status["losses"]["device"]["lines"]
     assert wire["sent"] == wire["whole"] + wire["partial"] + sum(wire["lost"].values())
     events = service.client.get(f"/api/v1/sessions/{session_id}/events").json()["events"]
-    assert [event["kind"] for event in events][:3] == ["interrupted", "reconnected", "resumed"]
+    first, *others = [event["kind"] for event in events][:3]
+    assert first == "interrupted"
+    assert sorted(others) == ["reconnected", "resumed"], "the first line may be told before or after the link"
 
 
 def test_a_scan_that_is_started_long_after_its_session_was_created_is_no_lost_scanner(running):
