@@ -43,7 +43,7 @@ CREDIT = 8
 CARRIED_SHARE = 0.95
 """A rate is carried when lines leave, and are answered, at this share of it at least, and none is lost."""
 _HEADER = struct.Struct("<4sHHQQIIII")
-_LARGEST_MESSAGE_BYTES = 4 << 20
+_LARGEST_MESSAGE_BYTES = 64 << 20
 _SPAWN = multiprocessing.get_context("spawn")
 _PATIENCE_S = 300.0
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")

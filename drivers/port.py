@@ -97,6 +97,7 @@ class Port:
             if not readable:
                 return b""
             data = os.read(self._fd, _READ_BYTES)
+            data += self._rest(len(data))
         except BlockingIOError:
             return b""
         except (OSError, ValueError) as error:
@@ -104,6 +105,18 @@ class Port:
         if not data:
             raise self._lost(None)
         return data
+
+    def _rest(self, had: int) -> bytes:
+        """What else waits behind the first `had` bytes: a terminal gives some 4,000 at a time, whatever it holds."""
+        pieces: list[bytes] = []
+        with contextlib.suppress(OSError):  # nothing waits; or the port is lost, which the next reading tells
+            while 0 < had < _READ_BYTES:
+                piece = os.read(self._fd, _READ_BYTES - had)
+                if not piece:
+                    break
+                pieces.append(piece)
+                had += len(piece)
+        return b"".join(pieces)
 
     def write(self, data: bytes) -> int:
         """Write what the port takes at once; return how many bytes that were.

@@ -71,12 +71,9 @@ class Rig:
 
     def part_from_sensor(self, position_mm: float) -> Pose:
         """Return the sensor's pose at a stage position."""
-        return self.part_from_stage @ self._shift(position_mm) @ self.stage_from_sensor
-
-    def _shift(self, position_mm: float) -> Pose:
         if self.turntable is not None:
-            return self.turntable.turn(position_mm)
-        return Pose(np.eye(3), position_mm * self.travel_stage)
+            return self.part_from_stage @ self.turntable.turn(position_mm) @ self.stage_from_sensor
+        return self.part_from_stage @ self.stage_from_sensor.moved(position_mm * self.travel_stage)
 
     def _travel(self, position_mm: float, laser_sensor_mm: Float64Array) -> Float64Array:
         """Return the unit direction of travel in the part frame; of a turntable the tangent at the laser."""
@@ -110,9 +107,9 @@ class Rig:
                 "scanner, or give a position for each line"
             )
         part_from_sensor = self.part_from_sensor(at_mm)
-        points_mm = np.stack([profile.x_mm, np.zeros_like(profile.x_mm), profile.z_mm], axis=1)
-        no_return = np.isnan(profile.x_mm) | np.isnan(profile.z_mm)
-        points_mm[no_return] = np.nan
+        # y is 0 in the laser plane; a NaN of x or z makes all three coordinates NaN.
+        in_plane_mm = np.stack([profile.x_mm, profile.z_mm], axis=1)
+        points_mm = in_plane_mm @ part_from_sensor.rotation.T[::2] + part_from_sensor.translation_mm
         travel = self._travel(float(at_mm), profile.laser_mm)
         normal = part_from_sensor.rotate(np.array([0.0, 1.0, 0.0]))
         return Scanline(
@@ -121,7 +118,7 @@ class Rig:
             pass_index=profile.pass_index,
             line_index=profile.line_index,
             device_time_s=profile.device_time_s,
-            points_mm=part_from_sensor.apply(points_mm),
+            points_mm=points_mm,
             missing=profile.missing,
             laser_mm=part_from_sensor.apply(profile.laser_mm),
             plane_normal=-normal if float(normal @ travel) < 0 else normal,

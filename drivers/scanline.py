@@ -119,11 +119,27 @@ class Pose:
 
     def __matmul__(self, other: "Pose") -> "Pose":
         """`a_from_b @ b_from_c` is `a_from_c`."""
-        return Pose(self.rotation @ other.rotation, self.rotation @ other.translation_mm + self.translation_mm)
+        return Pose._of_checked(
+            self.rotation @ other.rotation, self.rotation @ other.translation_mm + self.translation_mm
+        )
 
     def inverse(self) -> "Pose":
         """`a_from_b.inverse()` is `b_from_a`."""
-        return Pose(self.rotation.T.copy(), -self.rotation.T @ self.translation_mm)
+        return Pose._of_checked(self.rotation.T.copy(), -self.rotation.T @ self.translation_mm)
+
+    def moved(self, by_mm: Float64Array) -> "Pose":
+        """The same rotation, `by_mm` (3,) of the target frame farther."""
+        return Pose._of_checked(self.rotation, self.translation_mm + by_mm)
+
+    @classmethod
+    def _of_checked(cls, rotation: Float64Array, translation_mm: Float64Array) -> "Pose":
+        """A pose made from poses: what a check of it costs is more than what a scanline has time for."""
+        pose = object.__new__(cls)
+        object.__setattr__(pose, "rotation", rotation)
+        object.__setattr__(pose, "translation_mm", translation_mm)
+        read_only(rotation)
+        read_only(translation_mm)
+        return pose
 
 
 @dataclass(frozen=True, slots=True)

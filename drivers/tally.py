@@ -237,8 +237,23 @@ class BootLedger:
         self._bytes_skipped = 0
         self._no_return: Counter[str] = Counter()
 
-    def chunk(self, sequence: int, line: int, dropped_chunks: int, dropped_lines: int, pass_index: int = 0) -> Arrival:
-        """Enter a chunk that was read, as stored; what comes of it otherwise is told by `not_kept`."""
+    def is_next(self, sequence: int) -> bool:
+        """True when nothing of that number or a later one has been entered."""
+        return unwrap_u32(self._next_sequence, sequence) >= self._next_sequence
+
+    def chunk(
+        self,
+        sequence: int,
+        line: int,
+        dropped_chunks: int,
+        dropped_lines: int,
+        pass_index: int = 0,
+        n_chunks: int = 1,
+    ) -> Arrival:
+        """Enter a chunk that was read, as stored; what comes of it otherwise is told by `not_kept`.
+
+        Of a line's chunks whose numbers follow each other `n_chunks` are entered at once; the first `is_next` then.
+        """
         number = unwrap_u32(self._next_sequence, sequence)
         line = unwrap_u32(self._next_line, line)
         if number < self._next_sequence:
@@ -246,10 +261,10 @@ class BootLedger:
         gap_account = self._account(pass_index if self._told_pass is None else self._told_pass)
         account = self._of_chunk = self._account(pass_index)
         cause = self._advance(number, dropped_chunks, gap_account)
-        self._next_sequence = number + 1
+        self._next_sequence = number + n_chunks
         self._told_pass = pass_index
-        account.sent += 1
-        account.stored += 1
+        account.sent += n_chunks
+        account.stored += n_chunks
         if line < self._next_line:
             return Arrival(Kind.NEW, line, False)
         self._advance_line(line, dropped_lines, cause, gap_account)
@@ -299,10 +314,10 @@ class BootLedger:
         """Enter points of a line that the device gave no distance for, by reason."""
         self._no_return.update(counts)
 
-    def not_kept(self, reason: str) -> None:
-        """Move the chunk entered last from the stored to the lost ones."""
-        self._of_chunk.stored -= 1
-        self._of_chunk.lost[reason] += 1
+    def not_kept(self, reason: str, n_chunks: int = 1) -> None:
+        """Move the chunks entered last from the stored to the lost ones."""
+        self._of_chunk.stored -= n_chunks
+        self._of_chunk.lost[reason] += n_chunks
 
     def line_closed(self, *, whole: bool) -> None:
         """Enter that the line opened first was handed on."""

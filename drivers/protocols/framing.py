@@ -7,6 +7,7 @@ one frame: even where a closing zero is hit, the next frame's opening zero ends 
 import zlib
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 from cobs import cobs
 
@@ -16,6 +17,7 @@ MAX_BODY_BYTES = 503
 """Longest body: 503 + 4 (CRC) + 2 (COBS) + 2 (zeros) = 511 bytes on the wire."""
 MIN_BODY_BYTES = 1
 _CRC_BYTES = 4
+_CRC_RESIDUE = 0x2144DF1C  # of whatever ends in its own CRC-32, little endian
 _MAX_CODED_BYTES = MAX_FRAME_BYTES - 2
 
 
@@ -41,8 +43,7 @@ class Damage:
     n_bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class Body:
+class Body(NamedTuple):
     """An intact frame's content without its CRC; `n_bytes` is what it took on the wire."""
 
     data: bytes
@@ -85,11 +86,13 @@ class FrameDecoder:
         found: list[Body | Damage] = []
         *ended, rest = bytes(data).split(b"\0")
         for piece in ended:
-            self._keep(piece)
-            if len(self._coded) + self._skipped_bytes:
-                found.append(self._close())
+            if self._coded or self._skipped_bytes:  # began in bytes received earlier
+                self._keep(piece)
+                found.append(self._close(bytes(self._coded), self.pending_bytes + 1))
+            elif piece:
+                found.append(self._close(piece, self._opened + len(piece) + 1))
             else:
-                self.padding_bytes += int(self._opened)
+                self.padding_bytes += self._opened
                 self._opened = True
         self._keep(rest)
         return found
@@ -109,10 +112,9 @@ class FrameDecoder:
         else:
             self._coded += piece
 
-    def _close(self) -> Body | Damage:
-        """End the frame under way at the zero that has just been read."""
-        n_bytes = self.pending_bytes + 1
-        verdict = DamageReason.TOO_LONG if self._skipped_bytes else _open(self._coded)
+    def _close(self, coded: bytes, n_bytes: int) -> Body | Damage:
+        """End the frame of these bytes at the zero that has just been read; both zeros count in `n_bytes`."""
+        verdict = DamageReason.TOO_LONG if self._skipped_bytes or len(coded) > _MAX_CODED_BYTES else _open(coded)
         opened = self._opened
         self._coded.clear()
         self._skipped_bytes = 0
@@ -122,14 +124,11 @@ class FrameDecoder:
         return Damage(verdict if opened else DamageReason.DEBRIS, n_bytes)
 
 
-def _open(coded: bytearray) -> bytes | DamageReason:
+def _open(coded: bytes) -> bytes | DamageReason:
     try:
-        content = bytes(cobs.decode(bytes(coded)))
+        content: bytes = cobs.decode(coded)
     except cobs.DecodeError:
         return DamageReason.BAD_COBS
-    body, crc = content[:-_CRC_BYTES], content[-_CRC_BYTES:]
     if len(content) < MIN_BODY_BYTES + _CRC_BYTES:
         return DamageReason.TOO_SHORT
-    if zlib.crc32(body) != int.from_bytes(crc, "little"):
-        return DamageReason.BAD_CRC
-    return body
+    return content[:-_CRC_BYTES] if zlib.crc32(content) == _CRC_RESIDUE else DamageReason.BAD_CRC

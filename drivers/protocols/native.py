@@ -6,6 +6,7 @@ messages say, `framing.py` frames and checksums, `native_host.py` and the simula
 
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +41,7 @@ from drivers.scanline import DeviceInfo, SensorGeometry
 _STATUS = struct.Struct("<IBBIIIII")
 _HELLO = struct.Struct("<BHHqH3i3i2iI")
 _CHUNK = struct.Struct("<IIIIQBq3iqqIIHH")
+_RUN = struct.Struct("<II63sH")  # the same bytes, as far as they differ among the chunks of one line
 _ACK = struct.Struct("<HBB")
 _COMMAND = struct.Struct("<H")
 _START = struct.Struct("<HqqqI")
@@ -104,8 +106,21 @@ class Decoder:
         return self._frames.padding_bytes
 
     def receive(self, data: bytes) -> list[Message | Damage]:
-        """Take the next bytes; return what they complete."""
-        return [self._judge(item) for item in self._frames.receive(data)]
+        """Take the next bytes; return what they complete, chunks that continue each other as one."""
+        found: list[Message | Damage] = []
+        run: _Run | None = None
+        for item in self._frames.receive(data):
+            if run is not None:
+                if isinstance(item, Body) and run.takes(item.data):
+                    self.accepted_bytes += item.n_bytes
+                    continue
+                found[-1] = run.chunk()
+            said = self._judge(item)
+            found.append(said)
+            run = _Run(said) if isinstance(said, Chunk) else None
+        if run is not None:
+            found[-1] = run.chunk()
+        return found
 
     def reset(self) -> list[Damage]:
         """Forget the frame under way, as after a lost link; return its bytes as damage."""
@@ -124,6 +139,46 @@ class Decoder:
             return Damage(DamageReason.BAD_LAYOUT, item.n_bytes)
         self.accepted_bytes += item.n_bytes
         return message
+
+
+class _Run:
+    """Chunks of one line that continue each other: numbers and places in a row, and the same header otherwise."""
+
+    def __init__(self, first: Chunk) -> None:
+        self._first = first
+        self._points: list[bytes] = []
+        self._repeated: bytes = _RUN.unpack_from(_chunk_head(first))[2]
+        self._next_sequence = (first.sequence + 1) % 2**32
+        self._next_point = first.first_point + len(first.points)
+
+    def takes(self, body: bytes) -> bool:
+        """Take a frame's body; False, and nothing taken, when it is none of the run."""
+        n_bytes = len(body) - 1 - _CHUNK.size
+        if n_bytes < _POINT_BYTES or n_bytes % _POINT_BYTES or body[0] != Type.CHUNK:
+            return False
+        boot_id, sequence, repeated, first_point = _RUN.unpack_from(body, 1)
+        next_point = first_point + n_bytes // _POINT_BYTES
+        if (
+            repeated != self._repeated
+            or sequence != self._next_sequence
+            or first_point != self._next_point
+            or boot_id != self._first.boot_id
+            or next_point > self._first.points_in_line
+        ):
+            return False
+        self._points.append(body[1 + _CHUNK.size :])
+        self._next_sequence = (sequence + 1) % 2**32
+        self._next_point = next_point
+        return True
+
+    def chunk(self) -> Chunk:
+        """The run as one chunk."""
+        first = self._first
+        if not self._points:
+            return first
+        points = np.frombuffer(b"".join((first.points.tobytes(), *self._points)), dtype="<i4").reshape(-1, 2)
+        sizes = (len(first.points), *(len(piece) // _POINT_BYTES for piece in self._points))
+        return replace(first, points=points, sizes=sizes)
 
 
 def _status_payload(status: Status) -> bytes:
@@ -203,7 +258,11 @@ def _chunk_payload(chunk: Chunk) -> bytes:
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"a chunk's points have shape (k, 2), not {points.shape}")
     _check_span(chunk.points_in_line, chunk.first_point, len(points))
-    head = _CHUNK.pack(
+    return _chunk_head(chunk) + points.tobytes()
+
+
+def _chunk_head(chunk: Chunk) -> bytes:
+    return _CHUNK.pack(
         chunk.boot_id,
         chunk.sequence,
         chunk.pass_index,
@@ -219,7 +278,6 @@ def _chunk_payload(chunk: Chunk) -> bytes:
         chunk.points_in_line,
         chunk.first_point,
     )
-    return head + points.tobytes()
 
 
 def _chunk(payload: bytes) -> Chunk:

@@ -3,7 +3,8 @@
 `docs/protocol.md` is the specification. Numbers that count (sequences, lines, drops) are u32 and wrap.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TypeAlias
 
@@ -116,6 +117,8 @@ class OtherVersion:
 class Chunk:
     """A piece of one profile with the whole header of its line, so that it can be placed alone.
 
+    What was read in one go may hold several that follow each other in one line: they come as one, with the first one's
+    number and place, all their points, and `sizes`, the number of points of each; empty for a single chunk.
     `points` (k, 2) int32 are x, z in 0.1 um, NO_RETURN for both where there was none. `laser` is x, y, z in 0.1 um,
     `position` is counts or nanometres as `position_kind` says, `line_spacing_nm` and `step_nm` may be UNKNOWN_NM.
     `dropped_chunks` (`dropped_lines`) counts what the device dropped itself among the numbers below this one's.
@@ -136,6 +139,25 @@ class Chunk:
     points_in_line: int
     first_point: int
     points: Int32Array
+    sizes: tuple[int, ...] = ()
+
+    @property
+    def n_chunks(self) -> int:
+        """How many chunks of the wire these are."""
+        return len(self.sizes) or 1
+
+    def apart(self) -> Iterator["Chunk"]:
+        """The single chunks, as they were on the wire."""
+        start = 0
+        for number, size in enumerate(self.sizes or (len(self.points),)):
+            yield replace(
+                self,
+                sequence=(self.sequence + number) % 2**32,
+                first_point=self.first_point + start,
+                points=self.points[start : start + size],
+                sizes=(),
+            )
+            start += size
 
 
 @dataclass(frozen=True, slots=True)

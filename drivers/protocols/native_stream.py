@@ -37,19 +37,23 @@ class OpenLine:
         """True when every point's chunk has arrived."""
         return self._n_missing == 0
 
+    def has_room_for(self, chunk: Chunk) -> bool:
+        """True unless a chunk of this line contradicts those before."""
+        return (
+            chunk.pass_index == self.header.pass_index
+            and chunk.points_in_line == len(self._missing)
+            and 0 not in self._missing_flags[_place(chunk)]
+        )
+
     def add(self, chunk: Chunk) -> bool:
-        """Take a chunk of this line; False, and nothing taken, when it contradicts those before."""
-        place = slice(chunk.first_point, chunk.first_point + len(chunk.points))
-        if (
-            chunk.pass_index != self.header.pass_index
-            or chunk.points_in_line != len(self._missing)
-            or 0 in self._missing_flags[place]
-        ):
+        """Take a chunk of this line; False, and nothing taken, when there is no room for it."""
+        if not self.has_room_for(chunk):
             return False
+        place = _place(chunk)
         self._points[place] = chunk.points
         self._missing[place] = False
         self._n_missing -= len(chunk.points)
-        self.n_chunks += 1
+        self.n_chunks += chunk.n_chunks
         return True
 
     def profile(self, info: DeviceInfo, encoder_mm_per_count: float) -> Profile:
@@ -73,6 +77,10 @@ class OpenLine:
             line_spacing_mm=_length_mm(header.line_spacing_nm),
             step_mm=_length_mm(header.step_nm),
         )
+
+
+def _place(chunk: Chunk) -> slice:
+    return slice(chunk.first_point, chunk.first_point + len(chunk.points))
 
 
 def position_mm(chunk: Chunk, encoder_mm_per_count: float) -> float:
@@ -145,12 +153,21 @@ class ProfileStream:
         )
 
     def chunk(self, chunk: Chunk, arrival_s: float) -> bool:
-        """Take a chunk read at `arrival_s`; True when it was new and not of an earlier boot."""
+        """Take what was read at `arrival_s`; True when something of it was new and not of an earlier boot."""
         if not self._is_current(chunk.boot_id):
-            self._ledger.count_stale()
+            for _ in range(chunk.n_chunks):
+                self._ledger.count_stale()
             return False
+        if chunk.n_chunks > 1 and not (self._ledger.is_next(chunk.sequence) and self._fits(chunk)):
+            were_new = [self.chunk(single, arrival_s) for single in chunk.apart()]
+            return any(were_new)
         arrival = self._ledger.chunk(
-            chunk.sequence, chunk.line_index, chunk.dropped_chunks, chunk.dropped_lines, chunk.pass_index
+            chunk.sequence,
+            chunk.line_index,
+            chunk.dropped_chunks,
+            chunk.dropped_lines,
+            chunk.pass_index,
+            chunk.n_chunks,
         )
         if arrival.kind is not Kind.NEW:
             return False
@@ -158,7 +175,7 @@ class ProfileStream:
             self.close_line()
             self._open = OpenLine(chunk, arrival.line, arrival_s)
         if self._open is None or self._open.line_index != arrival.line:
-            self._ledger.not_kept("late")
+            self._ledger.not_kept("late", chunk.n_chunks)
         elif not self._open.add(chunk):
             self._ledger.not_kept("conflict")
         elif self._open.is_whole:
@@ -195,6 +212,11 @@ class ProfileStream:
         self._earlier_boots += self._ledger.tally()
         self._boot_id = boot_id
         self._ledger = BootLedger(boot_id=boot_id)
+
+    def _fits(self, run: Chunk) -> bool:
+        """True when chunks of one line share one fate: all are kept, or none."""
+        line = self._open
+        return line is None or line.header.line_index != run.line_index or line.has_room_for(run)
 
     def _is_current(self, boot_id: int) -> bool:
         """Begin a new account when the device has rebooted; False for an earlier boot."""

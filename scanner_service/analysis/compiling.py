@@ -24,6 +24,7 @@ def compile_kernels() -> MapSnapshot:
         live_map.add(replace(_line(5), pass_index=1))
         live_map.withdraw_pass(("warm-up", 0, 1))
         live_map.snapshot()
+        live_map.brief(np.arange(2, dtype=np.int32))
         live_map.close_all_passes()
     return live_map.snapshot()
 

@@ -60,6 +60,20 @@ def _in_all_columns(is_so: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
     return np.asarray(x & y & z)
 
 
+def _why_left_out(points_mm: Float64Array, missing: npt.NDArray[np.bool_]) -> dict[str, int]:
+    """How many of the points (m, 3) that are not kept there are of each reason; `missing` (m,) as in the scanline."""
+    arrived = points_mm[~missing]
+    dropout = int(_in_all_columns(np.isnan(arrived)).sum())
+    not_finite = len(arrived) - int(_in_all_columns(np.isfinite(arrived)).sum()) - dropout
+    counts = {
+        "dropout": dropout,
+        "missing": int(missing.sum()),
+        "not_finite": not_finite,
+        "out_of_bounds": len(arrived) - dropout - not_finite,
+    }
+    return {reason: count for reason, count in counts.items() if count}
+
+
 def quantise(line: Scanline, origin_mm: Float64Array) -> StoredLine:
     """Quantise a scanline to the stored truth; nothing is clamped, what cannot be kept is counted by reason.
 
@@ -82,33 +96,25 @@ def quantise(line: Scanline, origin_mm: Float64Array) -> StoredLine:
             f"laser position must be three numbers within {LASER_RANGE_MM:g} mm of the origin, "
             f"not {line.laser_mm.tolist()}"
         )
-    points = line.points_mm
-    is_nan = _in_all_columns(np.isnan(points))
-    finite = _in_all_columns(np.isfinite(points)) & ~line.missing
     with np.errstate(invalid="ignore", over="ignore"):
-        scaled = np.rint((points - origin_mm) / QUANTUM_MM)
-        inside = _in_all_columns(np.abs(scaled) <= _LIMIT_Q)
-    kept = finite & inside
-    dropped = {
-        "dropout": int((is_nan & ~line.missing).sum()),
-        "missing": int(line.missing.sum()),
-        "not_finite": int((~finite & ~is_nan & ~line.missing).sum()),
-        "out_of_bounds": int((finite & ~inside).sum()),
-    }
+        scaled = np.rint((line.points_mm - origin_mm) * PER_MM)
+        kept = _in_all_columns(np.abs(scaled) <= _LIMIT_Q) & ~line.missing
+    index = np.flatnonzero(kept).astype(np.int32)
+    dropped = {} if len(index) == len(kept) else _why_left_out(line.points_mm[~kept], line.missing[~kept])
     return StoredLine(
         device_id=line.device_id,
         boot_id=line.boot_id,
         pass_index=line.pass_index,
         line_index=line.line_index,
         device_time_s=line.device_time_s,
-        xyz_q=scaled[kept].astype(np.int32),
-        index=np.flatnonzero(kept).astype(np.int32),
-        point_count=len(points),
+        xyz_q=np.compress(kept, scaled, axis=0).astype(np.int32),
+        index=index,
+        point_count=len(kept),
         laser_mm=np.array(line.laser_mm, dtype=np.float64),
         plane_normal=np.array(line.plane_normal, dtype=np.float64),
         travel=np.array(line.travel, dtype=np.float64),
         position_mm=float(line.position_mm),
         line_spacing_mm=float(line.line_spacing_mm),
         step_mm=float(line.step_mm),
-        dropped={reason: count for reason, count in dropped.items() if count},
+        dropped=dropped,
     )

@@ -14,6 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.scanline import Float64Array
+from scanner_service.analysis.ahead import Ahead
+from scanner_service.analysis.brief import Brief, brief_of
 from scanner_service.analysis.change_log import ChangeLog
 from scanner_service.analysis.describing import describe
 from scanner_service.analysis.errors import MapFull
@@ -22,6 +24,8 @@ from scanner_service.analysis.gathering import reserve_scratch
 from scanner_service.analysis.global_radius import GlobalRadius
 from scanner_service.analysis.grid import (
     BLOCKS,
+    CELLS,
+    CHUNKS,
     blocks_to_evaluate,
     cell_side_q,
     count_points,
@@ -46,6 +50,9 @@ from scanner_service.analysis.points import (
 from scanner_service.analysis.radius import RadiusSettings, line_radius, point_spacing_mm
 from scanner_service.analysis.settling import drop_pass, settle_lines
 from scanner_service.analysis.snapshot import Int32Array, MapSnapshot, RadiusRule, Unreliable
+
+_AHEAD_ROWS = {"points": 1 << 16, "chunks": 1 << 15, "cells": 1 << 15, "blocks": 1 << 12}
+"""Rows of each table that have memory before they are needed: some fifty lines, about 13 MB in all."""
 
 _SHARED_BLOCKS = 600
 """Fewer blocks than this, what some lines touch, are evaluated sooner by the calling thread alone."""
@@ -114,6 +121,8 @@ class LiveMap:
         self._place: Int32Array = np.empty(self.settings.max_points, dtype=np.int32)
         self._used = 0
         self._first_new = 0  # rows from here on were never evaluated
+        self._ahead = Ahead(_AHEAD_ROWS)
+        self._ahead.watch("points", (self._points, self._place))
         self._grid = reserve_grid(1, 1)
         self._grid_rows = 0
         self._largest_radius_mm = 0.0
@@ -143,6 +152,7 @@ class LiveMap:
 
     def close(self) -> None:
         """End the map's own threads."""
+        self._ahead.close()
         if self._pool is not None:
             self._pool.shutdown()
 
@@ -285,7 +295,10 @@ class LiveMap:
 
         Returns how many points larger cells had to leave out.
         """
-        self._grid = reserve_grid(side_q, self.settings.max_points)
+        self._grid = grid = reserve_grid(side_q, self.settings.max_points)
+        self._ahead.watch("blocks", (grid.block, grid.bits, grid.block_laser_q, grid.fresh))
+        self._ahead.watch("cells", (grid.cell,))
+        self._ahead.watch("chunks", (grid.chunk, grid.chunk_next))
         self._first_new = 0
         rows, self._grid_rows = self._grid_rows, 0
         return sum(self._insert(line, first, last) for line, first, last in self._lines.ranges(rows))
@@ -301,10 +314,19 @@ class LiveMap:
         if taken < last - first:
             raise MapFull("the live map has no cells left: the points are scattered too widely for max_points")
         self._grid_rows = last
+        self._fetch_ahead()
         left_out = wanted - int(counted.sum())
         if left_out:
             self._leave_out(first + np.flatnonzero((counted == 0) & (said != NOT_COUNTED)))
         return left_out
+
+    def _fetch_ahead(self) -> None:
+        """Have the memory at hand that the next lines will touch."""
+        used = self._grid.used.tolist()
+        self._ahead.use("points", self._used)
+        self._ahead.use("chunks", used[CHUNKS])
+        self._ahead.use("blocks", used[BLOCKS])
+        self._ahead.use("cells", used[CELLS])
 
     def _estimate_global(self) -> int:
         """Take the median of the sample's flexible radii as the radius of the whole cloud, and re-key the map by it.
@@ -388,6 +410,10 @@ class LiveMap:
             noise_mm=self.settings.noise_mm,
             max_radius_mm=self._rules.max_radius_mm,
         )
+
+    def brief(self, rows: Int32Array) -> Brief:
+        """What a live stream tells of the given rows, as they were last evaluated."""
+        return brief_of(self._points, rows, self._rules.max_radius_mm)
 
     def _line_state(self) -> Lines:
         laser_q, pass_bit, waits = self._lines.kernel_columns()

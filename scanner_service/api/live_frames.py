@@ -46,10 +46,10 @@ def point_message(page: PointPage) -> bytes:
         0,
     )
     arrays = (
-        page.rows.astype("<u4"),
-        (points.points_mm - points.origin_mm).astype("<f4"),
-        points.density_per_mm2.astype("<f4"),
-        points.normals.astype("<f4"),
-        state_bits(page).astype("<u4"),
+        page.rows.astype("<u4", copy=False),
+        points.xyz_mm.astype("<f4", copy=False),
+        points.density_per_mm2.astype("<f4", copy=False),
+        points.normals.astype("<f4", copy=False),
+        state_bits(page).astype("<u4", copy=False),
     )
-    return header + b"".join(array.tobytes() for array in arrays)
+    return b"".join((header, *(array.data for array in arrays)))

@@ -204,7 +204,7 @@ class Engine:
 
     def _patience_s(self) -> float:
         """How long a line waits for room: a slow disk is waited for; on one that fails, the rest is counted at once."""
-        return 0.0 if self._record.writer_state().state == "failing" else _RECORD_PATIENCE_S
+        return 0.0 if self._record.is_failing else _RECORD_PATIENCE_S
 
     def _close_pass_before(self, line: StoredLine) -> None:
         """The first line of a pass ends the device's pass before it."""

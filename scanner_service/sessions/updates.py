@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanner_service.analysis.brief import Brief
 from scanner_service.analysis.live_map import LiveMap
-from scanner_service.analysis.snapshot import Int32Array, MapSnapshot
+from scanner_service.analysis.snapshot import Int32Array
 from scanner_service.sessions.results import Verdict
 
 
@@ -29,14 +30,14 @@ class Changes:
 
 @dataclass(frozen=True, slots=True)
 class PointPage:
-    """A part of the changed points: rows (k,), what the map says of them, and the verdict (k,).
+    """A part of the changed points: rows (k,), what the map says of them in brief, and the verdict (k,).
 
     A page read later says what holds later; what changes after `changes.version` is announced once more anyway.
     """
 
     changes: Changes
     rows: Int32Array
-    points: MapSnapshot
+    points: Brief
     verdict: Verdict
     is_first: bool
     is_last: bool
@@ -90,5 +91,5 @@ def read_page(live_map: LiveMap, verdicts: VerdictBook, changes: Changes, start:
     end = min(start + count, len(changes))
     rows = np.arange(start, end, dtype=np.int32) if changes.rows is None else changes.rows[start:end]
     return PointPage(
-        changes, rows, live_map.rows(rows), verdicts.of(rows), is_first=start == 0, is_last=end >= len(changes)
+        changes, rows, live_map.brief(rows), verdicts.of(rows), is_first=start == 0, is_last=end >= len(changes)
     )

@@ -104,10 +104,11 @@ def decode_line(encoded: bytes) -> StoredLine:
 
 def _encode_index(index: npt.NDArray[np.int32]) -> tuple[int, npt.NDArray[np.int32]]:
     """The index as (first, length) of its runs of consecutive places, or as it is where that is shorter."""
-    starts = np.flatnonzero(np.diff(index.astype(np.int64), prepend=-(2**40)) != 1)
+    steps = index[1:].astype(np.int64) - index[:-1]
+    starts = np.concatenate([np.zeros(min(len(index), 1), dtype=np.int64), np.flatnonzero(steps != 1) + 1])
     if 2 * len(starts) >= len(index):
         return _INDEX_RAW, index.astype("<i4", copy=False)
-    lengths = np.diff(starts, append=len(index))
+    lengths = np.append(starts[1:], len(index)) - starts
     return _INDEX_RUNS, np.stack((index[starts], lengths), axis=1).astype("<i4").ravel()
 
 

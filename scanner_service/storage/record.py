@@ -168,6 +168,11 @@ class Record:
         """How the writer is, and what it did since the record was opened."""
         return self._writer.state()
 
+    @property
+    def is_failing(self) -> bool:
+        """True while the record cannot be written."""
+        return self._writer.is_failing
+
     def lines(
         self, session_id: str, start: int = 0, stop: int | None = None, *, on_damage: OnDamage | None = None
     ) -> Iterator[tuple[int, StoredLine]]:

@@ -120,6 +120,11 @@ class Writer:
                 retries=self._counts["retries"],
             )
 
+    @property
+    def is_failing(self) -> bool:
+        """True while the record cannot be written; costs nothing, and is asked for every line."""
+        return self._state.state == "failing"
+
     def watermarks(self, session_id: str) -> Mapping[str, Watermark] | None:
         """The watermarks of a session written to since the record was opened; None of any other."""
         with self._change:

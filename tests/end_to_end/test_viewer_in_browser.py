@@ -88,6 +88,7 @@ def ring(x: float, y: float, radius: float) -> list[list[float]]:
 def region(number: int, reason: str, x: float, y: float, radius: float, measured: float, remedy: str) -> dict[str, Any]:
     """A region as the service describes it."""
     return {
+        "id": number,
         "number": number,
         "reason": reason,
         "area_mm2": np.pi * radius**2,
@@ -187,7 +188,9 @@ class StandIn:
                 if time.monotonic() - sent_at > 0.4:
                     sent_at = time.monotonic()
                     await socket.send_json(self.status(end, total))
-                    await socket.send_json({"type": "regions", "regions": REGIONS if end == total else []})
+                    known = REGIONS if end == total else []
+                    order = sorted(region["id"] for region in known)
+                    await socket.send_json({"type": "regions", "order": order, "regions": known})
                 rows = np.arange(end, min(end + step, total))
                 if end == total and self.touch:
                     rows, self.touch = np.array(self.touch), []

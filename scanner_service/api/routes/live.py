@@ -14,6 +14,7 @@ from scanner_service.api.access import Access, Identity
 from scanner_service.api.answers import plain
 from scanner_service.api.keys import Role
 from scanner_service.api.live_frames import MAX_POINTS, point_message
+from scanner_service.api.live_regions import RegionsTold
 from scanner_service.api.routes.sessions import status_answer
 from scanner_service.api.scopes import accepted_subprotocol, require
 from scanner_service.sessions.book import SessionBook
@@ -186,6 +187,7 @@ def rest_s(asked_s: float, now_s: float) -> float:
 async def _send_status(websocket: WebSocket, session: LiveSession, greeted: asyncio.Event) -> None:
     """Send the status about twice a second, and the regions when there is a new verdict; until both are final."""
     told: Results | None = None
+    regions_told = RegionsTold()
     while True:
         is_final = _is_final(session)
         status = await asyncio.to_thread(status_answer, session)
@@ -193,8 +195,8 @@ async def _send_status(websocket: WebSocket, session: LiveSession, greeted: asyn
         greeted.set()
         results = session.results()
         if results is not None and results is not told:
-            regions = [region.to_dict() for region in results.regions]
-            await _say(websocket, {"type": "regions", "version": results.snapshot.version, "regions": regions})
+            news = await asyncio.to_thread(regions_told.news, results.regions)
+            await _say(websocket, {"type": "regions", "version": results.snapshot.version, **news})
             told = results
         if is_final:
             return
@@ -202,4 +204,4 @@ async def _send_status(websocket: WebSocket, session: LiveSession, greeted: asyn
 
 
 async def _say(websocket: WebSocket, message: dict[str, object]) -> None:
-    await websocket.send_text(json.dumps(plain(message), allow_nan=False))
+    await websocket.send_text(await asyncio.to_thread(lambda: json.dumps(plain(message), allow_nan=False)))

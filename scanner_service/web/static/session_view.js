@@ -19,6 +19,7 @@ export class SessionView {
   #connection = null;
   #owed = 0; // binary messages taken in but not drawn yet; credit for them follows the picture
   #surveyed = null;
+  #known = new Map(); // regions by id, as they were last told of
 
   // tell: {points(), status(), regions(), opening(told), connection(state), trouble(text)}
   constructor(tell) {
@@ -116,7 +117,9 @@ export class SessionView {
       this.tell.status();
       if (moved && this.regions) this.tell.regions();
     } else if (message.type === "regions") {
-      this.regions = [...message.regions].sort((a, b) => (b.priority ?? 0) - (a.priority ?? 0) || a.number - b.number);
+      for (const region of message.regions) this.#known.set(region.id, region);
+      this.regions = message.order.map((id, at) => ({ ...this.#known.get(id), number: at + 1 }));
+      this.#known = new Map(this.regions.map((region) => [region.id, region]));
       this.tell.regions();
     } else if (message.type === "opening") {
       this.tell.opening(message);

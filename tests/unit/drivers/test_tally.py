@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.protocols.framing import Damage, DamageReason
+from drivers.protocols.native import Decoder, encode
 from drivers.protocols.native_messages import Chunk, EndReason, Hello, PositionKind, Status
 from drivers.protocols.native_stream import ProfileStream
 from drivers.protocols.unwrap import increase_u32, unwrap_u32
@@ -213,6 +214,46 @@ def test_chunks_out_of_order_are_stored_or_late_and_never_counted_twice(
     assert set(tally.chunks.lost) <= {"late", "conflict"}
     assert tally.chunks.stored + sum(tally.chunks.lost.values()) == 12
     assert tally.disagreements == tally.stale == 0
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.lists(st.integers(0, 23) | st.integers(0, 23).map(lambda at: slice(at, at + 8)), max_size=12),
+    st.sampled_from([0, U32 - 5]),
+    st.integers(1, 8),
+    st.data(),
+)
+def test_how_many_chunks_are_read_in_one_go_changes_neither_accounts_nor_profiles(
+    order: list[int | slice], first: int, chunks_a_line: int, data: st.DataObject
+) -> None:
+    frames = []
+    for at in range(32):
+        line, place = divmod(at, chunks_a_line)
+        line -= data.draw(st.sampled_from([0] * 9 + [1]))  # a device that contradicts itself
+        chunk = Chunk(
+            1, (first + at) % U32, 1 + line // 3, (first + line) % U32, 0, PositionKind.NONE, 0, (0, 0, 0), 1, 1, 0, 0,
+            chunks_a_line, place, np.array([[at, 1]]),
+        )  # fmt: skip
+        frames.append(encode(chunk) if line >= 0 else b"")
+    arriving = [frame for at in order for frame in (frames[at] if isinstance(at, slice) else [frames[at]])]
+    told = []
+    for reads in (arriving, [b"".join(arriving)]):
+        profiles: list[Profile] = []
+
+        def deliver(profile: Profile, kept: list[Profile] = profiles) -> bool:
+            kept.append(profile)
+            return len(kept) < 9
+
+        stream = ProfileStream(hello(1, status(1, first, first, 0, 0)), deliver)
+        decoder = Decoder()
+        for read in reads:
+            for item in decoder.receive(read):
+                assert isinstance(item, Chunk)
+                stream.chunk(item, 0.0)
+        stream.close_line()
+        assert stream.tally().chunks.balances
+        told.append((stream.tally(), [(p.line_index, p.missing.tolist(), p.x_mm.tobytes()) for p in profiles]))
+    assert told[0] == told[1]
 
 
 def test_lines_of_a_sorted_stream_hold_what_was_sent() -> None:
