@@ -119,6 +119,7 @@ class LiveMap:
         self.version = 0
         self._points: PointArray = reserve_points(self.settings.max_points)
         self._place: Int32Array = np.empty(self.settings.max_points, dtype=np.int32)
+        self._settled: Int32Array = np.empty(self.settings.max_points, dtype=np.int32)  # what a kernel found last
         self._used = 0
         self._first_new = 0  # rows from here on were never evaluated
         self._ahead = Ahead(_AHEAD_ROWS)
@@ -220,10 +221,9 @@ class LiveMap:
         closed = self._passes.close(key)
         if closed is None:
             return
-        settled = np.empty(self._used, dtype=np.int32)
         first_row, _, _ = self._lines.extents()
-        done = drop_pass(first_row, self._points, self._line_state().waits, 1 << closed.slot, settled)
-        self._pending.append(settled[:done].copy())
+        done = drop_pass(first_row, self._points, self._line_state().waits, 1 << closed.slot, self._settled)
+        self._pending.append(self._settled[:done].copy())
         self._lines.drop_pass(closed.number)
 
     def withdraw_pass(self, key: PassKey) -> int:
@@ -423,9 +423,8 @@ class LiveMap:
     def _settle(self, version: int) -> Int32Array:
         """Let the points settle that the passes have left behind; the rows of those that nothing else changed."""
         extents = self._lines.extents()
-        settled = np.empty(self._used, dtype=np.int32)
-        done = settle_lines(*extents, self._points, self._line_state(), self._rules, version, settled)
-        return settled[:done].copy()
+        done = settle_lines(*extents, self._points, self._line_state(), self._rules, version, self._settled)
+        return self._settled[:done].copy()
 
     def _max_radius_mm(self) -> float:
         limit = self.settings.max_radius_mm
