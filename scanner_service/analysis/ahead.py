@@ -53,29 +53,34 @@ class Ahead:
         """Look after these tables, whose rows are used in order, from now on instead of those of that name before."""
         self._stretches[name] = _Stretch(tables, self._margins[name])
 
-    def use(self, name: str, rows: int) -> None:
-        """Say that so many rows are used; never waits."""
-        stretch = self._stretches[name]
-        if self._madvise is None or 2 * (stretch.reached - rows) >= stretch.margin_rows:
+    def use(self, rows: Mapping[str, int]) -> None:
+        """Say how many rows of each stretch are used; never waits."""
+        if self._madvise is None or (self._fetching is not None and not self._fetching.done()):
             return
-        if self._fetching is None or self._fetching.done():
-            start, stretch.reached = max(rows, stretch.reached), rows + stretch.margin_rows
-            self._fetching = self._pool.submit(self._fetch, stretch.tables, start, stretch.reached)
+        wanted: list[tuple[Sequence[Table], int, int]] = []
+        for name, used in rows.items():
+            stretch = self._stretches[name]
+            if 2 * (stretch.reached - used) < stretch.margin_rows:
+                start, stretch.reached = max(used, stretch.reached), used + stretch.margin_rows
+                wanted.append((stretch.tables, start, stretch.reached))
+        if wanted:
+            self._fetching = self._pool.submit(self._fetch, wanted)
 
     def close(self) -> None:
         """End the thread."""
         self._closing.set()
         self._pool.shutdown()
 
-    def _fetch(self, tables: Sequence[Table], start: int, end: int) -> None:
-        for table in tables:
-            row_bytes = table.strides[0]
-            first = table.ctypes.data + min(start, len(table)) * row_bytes
-            last = table.ctypes.data + min(end, len(table)) * row_bytes
-            first -= first % mmap.PAGESIZE
-            for at in range(first, last, _PIECE_BYTES):
-                if self._closing.is_set() or not self._touch(at, min(_PIECE_BYTES, last - at)):
-                    return
+    def _fetch(self, wanted: Sequence[tuple[Sequence[Table], int, int]]) -> None:
+        for tables, start, end in wanted:
+            for table in tables:
+                row_bytes = table.strides[0]
+                first = table.ctypes.data + min(start, len(table)) * row_bytes
+                last = table.ctypes.data + min(end, len(table)) * row_bytes
+                first -= first % mmap.PAGESIZE
+                for at in range(first, last, _PIECE_BYTES):
+                    if self._closing.is_set() or not self._touch(at, min(_PIECE_BYTES, last - at)):
+                        return
 
     def _touch(self, address: int, n_bytes: int) -> bool:
         if self._madvise is None or self._madvise(address, n_bytes, _POPULATE_WRITE) == 0:

@@ -51,8 +51,8 @@ from scanner_service.analysis.radius import RadiusSettings, line_radius, point_s
 from scanner_service.analysis.settling import drop_pass, settle_lines
 from scanner_service.analysis.snapshot import Int32Array, MapSnapshot, RadiusRule, Unreliable
 
-_AHEAD_ROWS = {"points": 1 << 16, "chunks": 1 << 15, "cells": 1 << 15, "blocks": 1 << 12}
-"""Rows of each table that have memory before they are needed: some fifty lines, about 13 MB in all."""
+_AHEAD_ROWS = {"points": 1 << 17, "chunks": 1 << 16, "cells": 1 << 15, "blocks": 1 << 13}
+"""Rows of each table that have memory before they are needed: some hundred lines, about 20 MB in all."""
 
 _SHARED_BLOCKS = 600
 """Fewer blocks than this, what some lines touch, are evaluated sooner by the calling thread alone."""
@@ -323,10 +323,7 @@ class LiveMap:
     def _fetch_ahead(self) -> None:
         """Have the memory at hand that the next lines will touch."""
         used = self._grid.used.tolist()
-        self._ahead.use("points", self._used)
-        self._ahead.use("chunks", used[CHUNKS])
-        self._ahead.use("blocks", used[BLOCKS])
-        self._ahead.use("cells", used[CELLS])
+        self._ahead.use({"points": self._used, "chunks": used[CHUNKS], "blocks": used[BLOCKS], "cells": used[CELLS]})
 
     def _estimate_global(self) -> int:
         """Take the median of the sample's flexible radii as the radius of the whole cloud, and re-key the map by it.

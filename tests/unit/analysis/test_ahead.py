@@ -26,7 +26,7 @@ def test_as_many_rows_have_memory_as_were_asked_for_and_what_was_written_stays()
     ahead = Ahead({"table": ROWS // 4})
     before = resident_bytes()
     ahead.watch("table", (table,))
-    ahead.use("table", 1000)
+    ahead.use({"table": 1000})
     assert ahead._fetching is not None
     ahead._fetching.result()
     grown = resident_bytes() - before
@@ -41,8 +41,8 @@ def test_the_end_of_a_table_is_never_passed() -> None:
     table = np.zeros((1000, 3))
     ahead = Ahead({"table": 1 << 20})
     ahead.watch("table", (table, np.zeros(10)))
-    ahead.use("table", 990)
-    ahead.use("table", 1000)
+    ahead.use({"table": 990})
+    ahead.use({"table": 1000})
     ahead.close()
     assert not table.any()
 
@@ -50,7 +50,7 @@ def test_the_end_of_a_table_is_never_passed() -> None:
 def test_a_closed_map_leaves_no_thread_behind() -> None:
     before = set(threading.enumerate())
     live_map = LiveMap(MapSettings(max_points=1000))
-    live_map._ahead.use("points", 10)
+    live_map._ahead.use({"points": 10})
     live_map.close()
     deadline_s = time.monotonic() + 10.0
     while set(threading.enumerate()) - before and time.monotonic() < deadline_s:
