@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from scanner_service.analysis.intake import StoredLine
+from drivers.scanline import Scanline
+from scanner_service.analysis.intake import StoredLine, quantise
 from scanner_service.analysis.live_map import LiveMap, MapSettings
 from scanner_service.analysis.radius import LiveRule, RadiusSettings
 from scanner_service.analysis.snapshot import MapSnapshot
@@ -14,6 +15,7 @@ _PLACES = 600  # enough points for the first estimate of the global radius
 
 def compile_kernels() -> MapSnapshot:
     """Compile every kernel, or load it from the cache; returns a small map for whoever has kernels of their own."""
+    quantise(_scanline(), np.zeros(3))
     rules: tuple[LiveRule, ...] = ("global", "flexible", "line")
     for rule in rules:
         live_map = LiveMap(MapSettings(radius=RadiusSettings(rule=rule), max_points=4096))
@@ -27,6 +29,25 @@ def compile_kernels() -> MapSnapshot:
         live_map.brief(np.arange(2, dtype=np.int32))
         live_map.close_all_passes()
     return live_map.snapshot()
+
+
+def _scanline() -> Scanline:
+    nowhere = np.zeros(3)
+    return Scanline(
+        device_id="warm-up",
+        boot_id=0,
+        pass_index=0,
+        line_index=0,
+        device_time_s=0.0,
+        points_mm=np.zeros((2, 3)),
+        missing=np.zeros(2, dtype=np.bool_),
+        laser_mm=nowhere,
+        plane_normal=nowhere,
+        travel=nowhere,
+        position_mm=0.0,
+        line_spacing_mm=0.2,
+        step_mm=0.2,
+    )
 
 
 def _line(number: int, line_index: int | None = None, position_mm: float | None = None) -> StoredLine:

@@ -154,7 +154,7 @@ def place_of(grid: Grid, x: int, y: int, z: int) -> tuple[int, int]:
     return np.int64(b), ((cx & 3) << 4) | ((cy & 3) << 2) | (cz & 3)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def insert_points(
     grid: Grid,
     points: PointArray,

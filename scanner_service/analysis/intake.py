@@ -4,10 +4,12 @@ Coordinates become int32 multiples of `QUANTUM_MM` = 2**-13 mm from the session'
 is stored, analysed, exported and replayed, so every floor above computes from the same integers.
 """
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from drivers.scanline import Float64Array, Scanline, read_only
 
@@ -54,26 +56,6 @@ class StoredLine:
             read_only(array)
 
 
-def _in_all_columns(is_so: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """(n,) True where all three columns of (n, 3) are: `all(axis=1)`, whose loop over short rows costs five times."""
-    x, y, z = is_so.T
-    return np.asarray(x & y & z)
-
-
-def _why_left_out(points_mm: Float64Array, missing: npt.NDArray[np.bool_]) -> dict[str, int]:
-    """How many of the points (m, 3) that are not kept there are of each reason; `missing` (m,) as in the scanline."""
-    arrived = points_mm[~missing]
-    dropout = int(_in_all_columns(np.isnan(arrived)).sum())
-    not_finite = len(arrived) - int(_in_all_columns(np.isfinite(arrived)).sum()) - dropout
-    counts = {
-        "dropout": dropout,
-        "missing": int(missing.sum()),
-        "not_finite": not_finite,
-        "out_of_bounds": len(arrived) - dropout - not_finite,
-    }
-    return {reason: count for reason, count in counts.items() if count}
-
-
 def quantise(line: Scanline, origin_mm: Float64Array) -> StoredLine:
     """Quantise a scanline to the stored truth; nothing is clamped, what cannot be kept is counted by reason.
 
@@ -96,25 +78,62 @@ def quantise(line: Scanline, origin_mm: Float64Array) -> StoredLine:
             f"laser position must be three numbers within {LASER_RANGE_MM:g} mm of the origin, "
             f"not {line.laser_mm.tolist()}"
         )
-    with np.errstate(invalid="ignore", over="ignore"):
-        scaled = np.rint((line.points_mm - origin_mm) * PER_MM)
-        kept = _in_all_columns(np.abs(scaled) <= _LIMIT_Q) & ~line.missing
-    index = np.flatnonzero(kept).astype(np.int32)
-    dropped = {} if len(index) == len(kept) else _why_left_out(line.points_mm[~kept], line.missing[~kept])
+    places = len(line.points_mm)
+    xyz_q, index = np.empty((places, 3), dtype=np.int32), np.empty(places, dtype=np.int32)
+    counts = np.zeros(len(_REASONS), dtype=np.int64)
+    kept = _quantise(np.ascontiguousarray(line.points_mm), line.missing, origin_mm, xyz_q, index, counts)
     return StoredLine(
         device_id=line.device_id,
         boot_id=line.boot_id,
         pass_index=line.pass_index,
         line_index=line.line_index,
         device_time_s=line.device_time_s,
-        xyz_q=np.compress(kept, scaled, axis=0).astype(np.int32),
-        index=index,
-        point_count=len(kept),
+        xyz_q=xyz_q[:kept],
+        index=index[:kept],
+        point_count=places,
         laser_mm=np.array(line.laser_mm, dtype=np.float64),
         plane_normal=np.array(line.plane_normal, dtype=np.float64),
         travel=np.array(line.travel, dtype=np.float64),
         position_mm=float(line.position_mm),
         line_spacing_mm=float(line.line_spacing_mm),
         step_mm=float(line.step_mm),
-        dropped=dropped,
+        dropped={reason: count for reason, count in zip(_REASONS, counts.tolist(), strict=True) if count},
     )
+
+
+_REASONS = ("dropout", "missing", "not_finite", "out_of_bounds")
+_DROPOUT, _MISSING, _NOT_FINITE, _OUT_OF_BOUNDS = range(4)
+
+
+@njit(cache=True)  # so short that letting go of Python's lock would cost more
+def _quantise(
+    points_mm: Float64Array,
+    missing: npt.NDArray[np.bool_],
+    origin_mm: Float64Array,
+    xyz_q: npt.NDArray[np.int32],
+    index: npt.NDArray[np.int32],
+    counts: npt.NDArray[np.int64],
+) -> int:
+    """Write the points that can be kept, one behind the other, and count the others; returns how many are kept."""
+    kept = 0
+    for i in range(len(points_mm)):
+        x, y, z = points_mm[i, 0], points_mm[i, 1], points_mm[i, 2]
+        if missing[i]:
+            counts[_MISSING] += 1
+        elif math.isnan(x) and math.isnan(y) and math.isnan(z):
+            counts[_DROPOUT] += 1
+        elif not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+            counts[_NOT_FINITE] += 1
+        else:
+            x, y, z = (
+                np.rint((x - origin_mm[0]) * PER_MM),
+                np.rint((y - origin_mm[1]) * PER_MM),
+                np.rint((z - origin_mm[2]) * PER_MM),
+            )
+            if max(abs(x), abs(y), abs(z)) > _LIMIT_Q:
+                counts[_OUT_OF_BOUNDS] += 1
+                continue
+            xyz_q[kept, 0], xyz_q[kept, 1], xyz_q[kept, 2] = np.int32(x), np.int32(y), np.int32(z)
+            index[kept] = i
+            kept += 1
+    return kept

@@ -59,7 +59,7 @@ def used_radius_mm(points: PointArray, max_radius_mm: float) -> npt.NDArray[np.f
     return grown
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def write_points(
     points: PointArray,
     first: int,

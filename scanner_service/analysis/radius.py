@@ -62,7 +62,7 @@ def point_spacing_mm(xyz_q: npt.NDArray[np.int32], index: npt.NDArray[np.int32])
     return 0.5 * (math.sqrt(half[: n // 2].max()) + upper) * QUANTUM_MM
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def _squared_steps(xyz_q: npt.NDArray[np.int32], place: npt.NDArray[np.int32], squares: npt.NDArray[np.float64]) -> int:
     """Squared distances of neighbours in quanta, exact in float64 up to 8 m; returns how many there are."""
     n = 0
