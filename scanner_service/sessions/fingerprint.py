@@ -8,11 +8,14 @@ import numpy as np
 
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.sessions.results import Results
-from scanner_service.storage.encoding import encode_line
+from scanner_service.storage.encoding import PLAIN, encode_line
 
 
 class RawHash:
-    """SHA-256 over the encoded lines of a session in the order of their numbers (`docs/record.md` has the encoding)."""
+    """SHA-256 over the lines of a session in the order of their numbers, each in the plain encoding (`docs/record.md`).
+
+    The plain one whichever they are stored in, so that the hash of a line never changes.
+    """
 
     def __init__(self) -> None:
         self._digest = hashlib.sha256()
@@ -20,7 +23,7 @@ class RawHash:
 
     def add(self, line: StoredLine) -> None:
         """Take in the next line."""
-        self._digest.update(encode_line(line))
+        self._digest.update(encode_line(line, PLAIN))
         self.lines += 1
 
     def hexdigest(self) -> str:
