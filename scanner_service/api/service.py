@@ -65,7 +65,9 @@ class Service:
             book = SessionBook(record, retention, meshes=replay_dir)
             access = Access.open(data_dir, time.monotonic, secrets.token_bytes)
             exports = ExportDesk(
-                data_dir / "exports", lambda: RecordReader.open(record_at or data_dir / "record.sqlite")
+                data_dir / "exports",
+                lambda: RecordReader.open(record_at or data_dir / "record.sqlite"),
+                meshes=replay_dir,
             )
         except BaseException:
             record.close()

@@ -7,6 +7,7 @@ from dataclasses import fields
 import numpy as np
 
 from scanner_service.analysis.intake import StoredLine
+from scanner_service.rescan.reference import ReferenceCoverage
 from scanner_service.sessions.results import Results
 from scanner_service.storage.encoding import PLAIN, encode_line
 
@@ -40,7 +41,7 @@ def raw_sha256(lines: Iterable[StoredLine]) -> str:
 
 
 def verdict_sha256(results: Results) -> str:
-    """SHA-256 over everything that is said of every point, every region and every cell.
+    """SHA-256 over everything that is said of every point, every region, every cell and the nominal part.
 
     The version of the map is left out, since it counts readings, which differ from one playing to the next.
     """
@@ -61,13 +62,20 @@ def _parts(results: Results) -> Iterator[tuple[str, bytes]]:
                 yield item.name, np.float64(value).tobytes()
     yield "rescan", _bytes(results.report.rescan)
     yield "verdict", _bytes(results.report.reason)
-    for region in results.report.regions:
+    if results.reference is not None:
+        yield "reference", _areas(results.reference)
+    untouched = results.reference.untouched if results.reference is not None else ()
+    for region in (*results.report.regions, *untouched):
         told = (region.number, int(region.reason), region.point_count)
         yield "region", repr(told).encode()
         numbers = (region.area_mm2, region.measured_per_mm2, region.required_per_mm2, region.priority)
         yield "numbers", np.array(numbers).tobytes()
         for loop in (*region.outline_mm, region.centroid_mm, region.normal, region.point_rows):
             yield "of region", _bytes(loop)
+
+
+def _areas(reference: ReferenceCoverage) -> bytes:
+    return np.array([reference.area_mm2, reference.touched_mm2, reference.good_mm2]).tobytes()
 
 
 def _bytes(values: "np.ndarray[tuple[int, ...], np.dtype[np.generic]]") -> bytes:

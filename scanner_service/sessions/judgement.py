@@ -9,12 +9,12 @@ from dataclasses import replace
 from typing import Any
 
 from scanner_service.rescan.followed import Change, RegionBook
-from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionError
 from scanner_service.sessions.mirror import Mirror, difference_since
+from scanner_service.sessions.references import Nominal
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.sources import Source
 from scanner_service.sessions.updates import VerdictBook
@@ -37,13 +37,13 @@ class Judgement:
         engine: Engine,
         verdicts: VerdictBook,
         requirement: Requirement,
-        reference: ReferenceSurface | None,
+        nominal: Nominal,
         write_event: WriteEvent,
     ) -> None:
         self._engine = engine
         self._verdicts = verdicts
         self._requirement = requirement
-        self._reference = reference
+        self._nominal = nominal
         self._write_event = write_event
         self._regions = RegionBook()
         self._results: Results | None = None
@@ -71,7 +71,15 @@ class Judgement:
                 since = self._mirror.version
                 change = self._engine.ask(lambda engine: difference_since(engine.live_map, since)).result()
                 snapshot = self._mirror.apply(change)
-            found = judge(snapshot, self._requirement, source.geometry, source.towards_sensor, self._reference)
+            nominal = self._nominal
+            found = judge(
+                snapshot,
+                self._requirement,
+                source.geometry,
+                source.towards_sensor,
+                nominal.surface,
+                nominal.refused,
+            )
             with self._in_force:
                 changes = self._regions.follow(snapshot, found.regions)
                 results = self._followed(found)

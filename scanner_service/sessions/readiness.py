@@ -18,7 +18,7 @@ def kernels_are_ready() -> bool:
 
 
 def warm_up() -> None:
-    """Compile every kernel of record, map, regions and passes, or load it from the cache; at once when that was done."""
+    """Compile every kernel of record, map, regions and passes, or load it from the cache; at once when it was done."""
     with _LOCK:
         if not _READY.is_set():
             compile_packing()

@@ -14,13 +14,14 @@ from drivers.scanline import Scanline
 from drivers.tally import PassTally
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey
-from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.rescan.region import RegionStatus
+from scanner_service.sessions.calibration import CALIBRATED, calibration_of
 from scanner_service.sessions.chronicle import Chronicle
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionBusy, SessionError
 from scanner_service.sessions.judgement import Judgement
 from scanner_service.sessions.readiness import warm_up
+from scanner_service.sessions.references import NO_NOMINAL, Nominal
 from scanner_service.sessions.reopening import take_in
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.scan_clock import ScanClock
@@ -46,7 +47,7 @@ class LiveSession:
         record: Record,
         source: Source,
         clock: Callable[[], float] = time.monotonic,
-        reference: ReferenceSurface | None = None,
+        nominal: Nominal = NO_NOMINAL,
     ) -> None:
         self.row = row
         self.settings = SessionSettings.from_dict(row.settings)
@@ -56,7 +57,7 @@ class LiveSession:
         self._record = record
         self._chronicle = Chronicle(record, row.session_id)
         self._judgement = Judgement(
-            self.engine, self.verdicts, self.settings.requirement(), reference, self._chronicle.event
+            self.engine, self.verdicts, self.settings.requirement(), nominal, self._chronicle.event
         )
         self._time = ScanClock(clock)
         self._state = row.state
@@ -145,9 +146,11 @@ class LiveSession:
                 source.towards_sensor = None  # the passes look from several sides: each is judged by its own rays
             self.source, self._state = source, "scanning"
             self._time.start()
-            try:
+            try:  # what the pass is judged by is in the record before any line of it
+                self.event(CALIBRATED, calibration_of(source))
                 source.start(self)
             except BaseException:
+                self.event(CALIBRATED, calibration_of(known))
                 self._time.stop()
                 self.source, self._state = known, "stopped"
                 source.stop()

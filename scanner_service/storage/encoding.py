@@ -55,8 +55,8 @@ def encode_line(line: StoredLine, version: int = PACKED) -> bytes:
         reasons = [_reason(reason, count) for reason, count in line.dropped.items()]
     except struct.error as error:
         raise NotStorable(f"line {line.line_index} of {line.device_id} does not fit the record: {error}") from error
-    coordinates = points.astype("<i4", copy=False) if version == PLAIN else pack(points)
-    return b"".join((header, device, *reasons, words, coordinates))
+    coordinates = points.astype("<i4", copy=False).data if version == PLAIN else pack(points)
+    return b"".join((header, device, *reasons, words.data, coordinates))
 
 
 def decode_line(encoded: bytes) -> StoredLine:

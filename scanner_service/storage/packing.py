@@ -73,7 +73,7 @@ def compile_packing() -> None:
     pack(np.zeros((2, 3), dtype=np.int32))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _pack(xyz_q, room):  # type: ignore[no-untyped-def]
     """Fill `room` (uint8); returns how many bytes were used."""
     count = xyz_q.shape[0]
@@ -115,14 +115,14 @@ def _pack(xyz_q, room):  # type: ignore[no-untyped-def]
     return used
 
 
-@njit(cache=True, nogil=True, inline="always")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, inline="always")
 def _step(xyz_q, row, column):  # type: ignore[no-untyped-def]
     """From one point to the next, as a 32-bit integer has it."""
     step = np.int64(xyz_q[row, column]) - np.int64(xyz_q[row - 1, column])
     return ((step + 2147483648) & 4294967295) - 2147483648
 
 
-@njit(cache=True, nogil=True, inline="always")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, inline="always")
 def _put(room, place, value, width):  # type: ignore[no-untyped-def]
     for byte in range(width):
         room[place + byte] = (value >> (8 * byte)) & 255
