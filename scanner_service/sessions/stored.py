@@ -10,7 +10,7 @@ import numpy as np
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.live_map import LiveMap
 from scanner_service.analysis.passes import PassKey, pass_key
-from scanner_service.analysis.snapshot import Unreliable
+from scanner_service.analysis.snapshot import MapSnapshot, Unreliable
 from scanner_service.rescan.followed import RegionBook
 from scanner_service.sessions.calibration import calibration_after, geometry_from, towards_sensor_from
 from scanner_service.sessions.errors import SourceUnusable
@@ -157,11 +157,10 @@ def read_session(
     kept = set(_evenly(ends[:-1], MOST_STAGES - 1))
     open_passes: dict[str, PassKey] = {}
 
-    def judged(lines: int | None) -> Results:
-        """The verdict on the map as it is, by what was known of the scanner after so many lines."""
+    def judged(snapshot: MapSnapshot, lines: int | None = None) -> Results:
+        """The verdict on a snapshot, by what was known of the scanner after so many lines."""
         kept = calibration_after(row.calibration, events, lines)
         geometry, towards_sensor = geometry_from(kept), towards_sensor_from(kept)
-        snapshot = live_map.snapshot()
         return judge(snapshot, settings.requirement(), geometry, towards_sensor, nominal.surface, nominal.refused)
 
     try:
@@ -175,7 +174,7 @@ def read_session(
                 if over in withdrawn:  # at once, so that no stage tells of it
                     ledger.withdrawn(live_map.withdraw_pass(over))
                 if raw.lines in kept:
-                    found = judged(number)
+                    found = judged(live_map.snapshot(), number)
                     stages.append(_stage((over,), raw.lines, found))
                     first = first or found
             open_passes[line.device_id] = pass_key(line)
@@ -186,9 +185,11 @@ def read_session(
             if points := live_map.withdraw_pass(key):
                 ledger.withdrawn(points)
         ledger.received = ledger.stored = raw.lines
-        results = _followed(judged(None), events)
+        snapshot = live_map.snapshot()
     finally:
         live_map.close()
+        del live_map  # judging needs as much memory as the map, and the map no more
+    results = _followed(judged(snapshot), events)
     last = tuple(key for key in open_passes.values() if key not in withdrawn)
     return StoredSession(
         row=row,
