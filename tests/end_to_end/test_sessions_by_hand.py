@@ -199,6 +199,29 @@ def test_a_record_file_is_replayed_over_rest_with_its_own_settings_and_verdict(r
     assert refused.status_code == 422 and "own settings" in refused.json()["detail"]
 
 
+def test_a_file_is_brought_over_rest_played_and_removed(running):
+    service = running.service()
+    scan = b"line,x_mm,y_mm,z_mm,laser_x_mm,laser_y_mm,laser_z_mm\n"
+    scan += b"".join(b"%d,%d,%d,0,2,%d,90\n" % (n, x, n, n) for n in range(4) for x in range(5))
+    brought = service.client.put("/api/v1/files/my scan.csv", content=scan)
+    assert (brought.status_code, brought.json()) == (
+        201,
+        {"name": "my scan.csv", "bytes": len(scan), "kind": "csv profiles"},
+    )
+    assert service.client.get("/api/v1/files").json()["files"] == [brought.json()]
+    session_id = service.create(kind="replay", file="my scan.csv")
+    service.start(session_id)
+    service.wait_for_state(session_id, "stopped")
+    assert service.status(session_id)["lines"] == 4
+    refused = service.client.put("/api/v1/files/my scan.csv", content=scan + b"4,0,4,0,2,4,90\n")
+    assert refused.status_code == 422 and "another file" in refused.json()["detail"]
+    assert service.client.put("/api/v1/files/x.bin", content=bytes(99)).status_code == 422
+    assert service.client.put("/api/v1/files/..%2Fx.csv", content=scan).status_code in (400, 404, 422)
+    assert service.client.delete("/api/v1/files/my scan.csv").status_code == 204
+    assert service.client.get("/api/v1/files").json()["files"] == []
+    assert service.status(session_id)["lines"] == 4
+
+
 def test_a_command_that_fails_leaves_no_empty_folder(tmp_path):
     out = tmp_path / "a" / "b"
     done = CliRunner().invoke(app, ["export", "latest", "--record", str(tmp_path / "none.sqlite"), "--out", str(out)])
