@@ -1,8 +1,9 @@
 """How fast lines become durable, beside a bare loop of write and fdatasync on the same disk; and how fast a session
 is open again. `python -m benchmarks.record append|reopen`, from a checkout.
 
-The record and the bare loop take turns in one run, with the same lines in batches of the same size. The record does all
-that a scan makes it do: encode, check for duplicates, checksum, commit, copy its log, answer.
+The record and the bare loop take turns in one run, with the same lines in batches of the same size; the loop writes the
+bytes that the record stores, and once more the lines as they come, unpacked. The record does all that a scan makes it
+do: encode, check for duplicates, checksum, commit, copy its log, answer. MB/s are those of the coordinates.
 """
 
 import argparse
@@ -27,7 +28,7 @@ from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
-from scanner_service.storage.encoding import encode_line
+from scanner_service.storage.encoding import PLAIN, encode_line
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import Limits
 
@@ -94,15 +95,19 @@ def measure_append(folder: Path, count: int, repeats: int) -> dict[str, Any]:
     """The record at full speed and line by line, each beside the bare loop; medians of the rounds."""
     lines = scan_lines(count)
     encoded = [encode_line(line) for line in lines]
-    rounds: dict[str, list[dict[str, float]]] = {"bare": [], "record": [], "bare_single": [], "record_single": []}
+    plain = [encode_line(line, PLAIN) for line in lines]
+    names = ("record", "bare", "bare_plain", "record_single", "bare_single", "bare_plain_single")
+    rounds: dict[str, list[dict[str, float]]] = {name: [] for name in names}
     singles = min(count, 500)
     for number in range(repeats):
         record_path = folder / f"record-{number}"
         told, batch = _append(record_path, lines)
         rounds["record"].append(told)
         rounds["bare"].append(_bare(folder / f"bare-{number}", encoded, batch))
+        rounds["bare_plain"].append(_bare(folder / f"bare-plain-{number}", plain, batch))
         rounds["record_single"].append(_append_one_by_one(folder / f"single-{number}", lines[:singles]))
         rounds["bare_single"].append(_bare(folder / f"bare-single-{number}", encoded[:singles], 1))
+        rounds["bare_plain_single"].append(_bare(folder / f"bare-plain-single-{number}", plain[:singles], 1))
         for path in folder.iterdir():
             path.unlink()
     medians = {
@@ -111,11 +116,17 @@ def measure_append(folder: Path, count: int, repeats: int) -> dict[str, Any]:
     return {
         "points_a_line": POINTS_A_LINE,
         "bytes_a_line": len(encoded[0]),
+        "plain_bytes_a_line": len(plain[0]),
         "lines": count,
         "repeats": repeats,
         **medians,
-        "ratio": medians["record"]["mb_per_s"] / medians["bare"]["mb_per_s"],
-        "ratio_single": medians["record_single"]["lines_per_s"] / medians["bare_single"]["lines_per_s"],
+        **{
+            f"ratio_to_{bare}{single}": medians[f"record{single}"]["lines_per_s"]
+            / medians[bare + single]["lines_per_s"]
+            for bare in ("bare", "bare_plain")
+            for single in ("", "_single")
+        },
+        "load": os.getloadavg()[0],
     }
 
 

@@ -15,7 +15,7 @@ from scanner_service.api.guard import Guard, GuardRules
 from scanner_service.api.login import login_router
 from scanner_service.api.origins import Allowlist
 from scanner_service.api.problems import Problem, ProblemTable, register_problems
-from scanner_service.api.routes import analyses, exports, health, live, passes, results, scanlines, sessions
+from scanner_service.api.routes import analyses, exports, files, health, live, passes, results, scanlines, sessions
 from scanner_service.api.scopes import Scoped, check_every_route_declares_a_scope, public
 from scanner_service.api.service import Service
 from scanner_service.rescan.passes.errors import PassOutOfReach, PlanningError
@@ -33,6 +33,7 @@ from scanner_service.sessions.errors import (
     SessionNotLive,
     SourceUnusable,
 )
+from scanner_service.sessions.file_shelf import MAX_FILE_BYTES
 from scanner_service.storage.errors import CreationKeyReused, RecordBusy, RecordError, SessionUnknown
 from scanner_service.storage.exports.errors import ExportError, ExtraMissing, FormatNotWritten
 from scanner_service.storage.formats.errors import FormatError
@@ -88,7 +89,7 @@ def make_app(service: Service, allowlist: Allowlist | None = None) -> ASGIApp:
     register_problems(app, problems)
     install_docs(app, problems.values())
     app.include_router(login_router())
-    for module in (health, sessions, scanlines, results, passes, exports, live, analyses):
+    for module in (health, sessions, scanlines, results, passes, exports, live, analyses, files):
         app.include_router(module.router)
 
     @app.get("/", dependencies=[Depends(public)], include_in_schema=False)
@@ -100,6 +101,6 @@ def make_app(service: Service, allowlist: Allowlist | None = None) -> ASGIApp:
     rules = GuardRules(
         allowlist=allowlist or Allowlist(),
         csp=web.CONTENT_SECURITY_POLICY,
-        body_limits_bytes={"/api/v1/sessions/": PUSH_BODY_BYTES},
+        body_limits_bytes={"/api/v1/sessions/": PUSH_BODY_BYTES, "/api/v1/files/": MAX_FILE_BYTES},
     )
     return Guard(app, rules)

@@ -56,7 +56,10 @@ class RigSourceIn(Strict):
 
 
 class ReplaySourceIn(Strict):
-    """A recorded scan that lies in the service's replay folder; `file` is its bare name."""
+    """A recorded scan that lies in the service's replay folder; `file` is its bare name.
+
+    Of a record file the newest session is played, or that of the id `session`, with the settings that it has.
+    """
 
     kind: Literal["replay"]
     file: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^/\\\x00]+$", examples=["part.ply"])]
@@ -64,6 +67,7 @@ class ReplaySourceIn(Strict):
     units: Literal["mm", "m", "inch", "auto"] | None = None
     line_spacing_mm: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
     laser_mm: Vector | None = None
+    session: Annotated[str, Field(min_length=1, max_length=100)] | None = None
 
 
 class PushSourceIn(Strict):

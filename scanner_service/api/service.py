@@ -15,6 +15,7 @@ from scanner_service.sessions.analyses import AnalysisBook
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SessionError
 from scanner_service.sessions.export_desk import ExportDesk
+from scanner_service.sessions.file_shelf import FileShelf
 from scanner_service.sessions.readiness import kernels_are_ready, warm_up
 from scanner_service.sessions.retention import Retention
 from scanner_service.storage.errors import RecordError
@@ -35,6 +36,7 @@ class Service:
     replay_dir: Path
     metrics: CollectorRegistry
     exports: ExportDesk
+    shelf: FileShelf
     closing: threading.Event
     analyses: AnalysisBook = field(default_factory=AnalysisBook)
 
@@ -65,13 +67,16 @@ class Service:
             book = SessionBook(record, retention, meshes=replay_dir)
             access = Access.open(data_dir, time.monotonic, secrets.token_bytes)
             exports = ExportDesk(
-                data_dir / "exports", lambda: RecordReader.open(record_at or data_dir / "record.sqlite")
+                data_dir / "exports",
+                lambda: RecordReader.open(record_at or data_dir / "record.sqlite"),
+                meshes=replay_dir,
             )
+            shelf = FileShelf(replay_dir, data_dir / "arriving")
         except BaseException:
             record.close()
             raise
         threading.Thread(target=warm_up, name="warm-up", daemon=True).start()
-        service = cls(book, access, replay_dir, metrics_of(book), exports, threading.Event())
+        service = cls(book, access, replay_dir, metrics_of(book), exports, shelf, threading.Event())
         threading.Thread(target=service._keep_to_the_retention, name="retention", daemon=True).start()
         return service
 

@@ -9,9 +9,9 @@ from drivers.scanline import Float64Array
 from scanner_service.analysis.intake import QUANTUM_MM
 from scanner_service.analysis.passes import pass_key
 from scanner_service.commands.options import parse_units
-from scanner_service.commands.replay import is_record
 from scanner_service.sessions.source_specs import RecordSpec
 from scanner_service.sessions.withdrawals import withdrawn_passes
+from scanner_service.storage.database import is_sqlite
 from scanner_service.storage.formats import FileEmpty, ReadOptions, open_cloud
 from scanner_service.storage.reader import RecordReader
 
@@ -36,7 +36,7 @@ def open_points(file: Path, units: str | None, session: str | None) -> OpenedClo
     ------
     FormatError, RecordError, SessionError, ValueError : with one plain sentence.
     """
-    if is_record(file):
+    if is_sqlite(file):
         if units is not None:
             raise ValueError("a record is in millimetres: leave out --units")
         return _of_record(file, session)

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from scanner_service.commands.options import Data, RecordFile, open_reader
+from scanner_service.commands.options import Data, RecordFile, meshes_in, open_reader
 from scanner_service.commands.serve import DEFAULT_DATA
 from scanner_service.commands.terminal import (
     check_folder,
@@ -44,9 +44,13 @@ def export_command(
         check_folder(out)
         with open_reader(data, record) as reader, work_progress("exporting", as_json) as progress:
             row = find_session(reader, session)
-            manifest = export_session(reader, row, wanted, out, datetime.now(UTC), progress.show, points_at_once)
+            manifest = export_session(
+                reader, row, wanted, out, datetime.now(UTC), progress.show, points_at_once, meshes_in(data)
+            )
         for damaged in manifest["damaged_lines"]:
             errors.print(f"left out: {damaged}", highlight=False, soft_wrap=True)
+        if manifest.get("reference_refused"):
+            errors.print(f"note: {manifest['reference_refused']}", highlight=False, soft_wrap=True)
         if as_json:
             show_json(manifest)
             return

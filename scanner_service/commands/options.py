@@ -32,6 +32,11 @@ def open_reader(data: Path, record: str | None) -> Iterator[RecordReader]:
         reader.close()
 
 
+def meshes_in(data: Path) -> Path:
+    """Where the reference meshes of a service lie whose folder is `data`."""
+    return data / "replay"
+
+
 def parse_units(text: str | None) -> Units | None:
     """A length unit: mm, m, inch or auto; None stays None."""
     if text is None or text in get_args(Units):

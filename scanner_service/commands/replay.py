@@ -27,6 +27,7 @@ from scanner_service.sessions.references import open_reference
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import RecordSpec, ReplaySpec
+from scanner_service.storage.database import is_sqlite
 from scanner_service.storage.formats.recording import ReadOptions
 from scanner_service.storage.formats.reference_mesh import ReferenceSpec
 from scanner_service.storage.reader import RecordReader
@@ -65,7 +66,7 @@ def replay_command(
         with Record.open(record or Path(folder) / "record.sqlite") as opened, contextlib.ExitStack() as stack:
             spec: RecordSpec | ReplaySpec
             nominal: ReferenceSurface | None = None
-            if is_record(file):
+            if is_sqlite(file):
                 _refuse_what_a_record_knows(
                     units=units, line_spacing=line_spacing, laser=laser, density=density, noise=noise,
                     plain_radius=plain_radius or None, preset=preset, surface_spacing=surface_spacing,
@@ -105,14 +106,16 @@ def replay_command(
                     nominal, found = open_reference(found, reference.absolute().parent)
                     settings = replace(settings, reference=found)
             check_folder(out)
-            book = SessionBook(opened)
+            book = SessionBook(opened, meshes=file.absolute().parent)
             stack.callback(book.close)
             live = book.create(file.name, spec, settings, origin_mm, source, reference=nominal)
             play(live, quiet=as_json)
             summary = write_outputs(out, live)
             results = live.results()
             if results is not None and results.reference_refused is not None:
-                raise ValueError(results.reference_refused)
+                if nominal is not None:
+                    raise ValueError(results.reference_refused)
+                errors.print(f"note: {results.reference_refused}", highlight=False, soft_wrap=True)
         if as_json:
             show_json(summary)
         elif results is not None:
@@ -159,15 +162,6 @@ def _refuse_what_a_record_knows(**options: object) -> None:
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
     if given:
         raise ValueError(f"a record is replayed with its own settings: leave out {', '.join(given)}")
-
-
-def is_record(file: Path) -> bool:
-    """True for a database of this kind; what else it may be is told by the readers."""
-    try:
-        with file.open("rb") as opened:
-            return opened.read(16) == b"SQLite format 3\x00"
-    except OSError:
-        return False
 
 
 def _known(value_mm: float) -> float | None:

@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from scanner_service.commands.options import Data, RecordFile, open_reader
+from scanner_service.commands.options import Data, RecordFile, meshes_in, open_reader
 from scanner_service.commands.serve import DEFAULT_DATA
-from scanner_service.commands.terminal import check_folder, console, plain_errors, show_json, work_progress
+from scanner_service.commands.terminal import check_folder, console, errors, plain_errors, show_json, work_progress
 from scanner_service.sessions.exporting import REPORT, REPORT_FILES, export_session
 from scanner_service.sessions.stored import find_session
 
@@ -25,7 +25,10 @@ def report_command(
         check_folder(out)
         with open_reader(data, record) as reader, work_progress("reporting", as_json) as progress:
             row = find_session(reader, session)
-            manifest = export_session(reader, row, [REPORT], out, datetime.now(UTC), progress.show)
+            now, meshes = datetime.now(UTC), meshes_in(data)
+            manifest = export_session(reader, row, [REPORT], out, now, progress.show, meshes=meshes)
+        if manifest["reference_refused"]:
+            errors.print(f"note: {manifest['reference_refused']}", highlight=False, soft_wrap=True)
         if as_json:
             show_json(manifest)
             return

@@ -14,6 +14,7 @@ from rich.table import Table
 from scanner_service.api.keys import read_local_key
 from scanner_service.commands.serve import DEFAULT_DATA, Data
 from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json
+from scanner_service.sessions.stored import named_session
 
 sessions_app = typer.Typer(
     help="The sessions of a running service: list, show with the ledger of losses, open, pause, resume, stop, delete.",
@@ -22,7 +23,8 @@ sessions_app = typer.Typer(
 )
 Url = Annotated[str, typer.Option(help="Where the service listens.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the answer as JSON.")]
-SessionId = Annotated[str, typer.Argument(help="The session's id, as `list` shows it.")]
+SessionId = Annotated[str, typer.Argument(help="The session's id, its first letters, or `latest`.")]
+WholeId = Annotated[str, typer.Argument(help="The whole id of the session, as `list` shows it.")]
 DEFAULT_URL = "http://127.0.0.1:8765"
 _POLL_S = 0.1
 
@@ -47,6 +49,21 @@ def ask(client: httpx.Client, method: str, path: str, **said: Any) -> Any:
     if answer.is_error:
         fail(f"the service refused: {answer.json().get('detail', answer.status_code)}")
     return answer.json() if answer.content else None
+
+
+def _named(client: httpx.Client, wanted: str) -> str:
+    """The whole id of the session that is meant."""
+
+    def ids() -> Iterator[str]:
+        after = None
+        while True:
+            page = ask(client, "GET", "/api/v1/sessions", params={"limit": 1000} | ({"after": after} if after else {}))
+            yield from (row["id"] for row in page["sessions"])
+            after = page["next"]
+            if after is None:
+                return
+
+    return named_session(ids(), wanted)
 
 
 def _path(session_id: str, rest: str = "") -> str:
@@ -85,6 +102,7 @@ def show_command(
 ) -> None:
     """What a session is doing, and what became of every line of it."""
     with plain_errors(), running_service(data, url) as client:
+        session_id = _named(client, session_id)
         _open(client, session_id, quiet=as_json)
         status = ask(client, "GET", _path(session_id))
         if as_json:
@@ -131,6 +149,7 @@ def open_command(
 ) -> None:
     """Reopen a session: its live map is built again from the record, with a progress bar."""
     with plain_errors(), running_service(data, url) as client:
+        session_id = _named(client, session_id)
         _open(client, session_id, quiet=as_json)
         status = ask(client, "GET", _path(session_id))
         if as_json:
@@ -170,7 +189,7 @@ def _telling(verb: str, told: str) -> None:
         session_id: SessionId, data: Data = DEFAULT_DATA, url: Url = DEFAULT_URL, as_json: AsJson = False
     ) -> None:
         with plain_errors(), running_service(data, url) as client:
-            status = ask(client, "POST", _path(session_id, f"/{verb}"))
+            status = ask(client, "POST", _path(_named(client, session_id), f"/{verb}"))
             if as_json:
                 show_json(status)
             else:
@@ -197,7 +216,7 @@ def note_command(
 ) -> None:
     """Keep notes with a session."""
     with plain_errors(), running_service(data, url) as client:
-        row = ask(client, "PATCH", _path(session_id), json={"notes": text})
+        row = ask(client, "PATCH", _path(_named(client, session_id)), json={"notes": text})
         if as_json:
             show_json(row)
         else:
@@ -206,7 +225,7 @@ def note_command(
 
 @sessions_app.command("delete")
 def delete_command(
-    session_id: SessionId,
+    session_id: WholeId,
     data: Data = DEFAULT_DATA,
     url: Url = DEFAULT_URL,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,

@@ -6,6 +6,7 @@ import math
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -27,6 +28,7 @@ from scanner_service.storage.formats.errors import FormatError
 
 console = Console(markup=False)  # what is told may hold brackets: paths, names, extras of a package
 errors = Console(stderr=True, markup=False)
+_MADE: ContextVar[tuple[Path, ...]] = ContextVar("folders that the command has made", default=())
 EXPECTED = (
     httpx.HTTPError,
     AnalysisError,
@@ -51,6 +53,7 @@ def fail(sentence: str) -> NoReturn:
 @contextlib.contextmanager
 def plain_errors() -> Iterator[None]:
     """Tell what users can mend in one sentence; let faults of the program show themselves."""
+    before = _MADE.set(())
     try:
         yield
     except EXPECTED as error:
@@ -58,16 +61,31 @@ def plain_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         errors.print("Stopped; what was not yet written is gone.")
         raise typer.Exit(130) from None
+    finally:
+        _remove_empty(_MADE.get())
+        _MADE.reset(before)
 
 
 def check_folder(folder: Path) -> None:
-    """Make the folder for results if need be, and make sure before any work that files can be written there."""
+    """Make the folder for results if need be, and make sure before any work that files can be written there.
+
+    Folders made here that are still empty when the command ends are removed again.
+    """
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    _MADE.set((*_MADE.get(), *made))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         fail(f"no file can be written to {folder} ({error.strerror}): choose another folder with --out")
+
+
+def _remove_empty(folders: tuple[Path, ...]) -> None:
+    """Remove the folders, the innermost first, as far as they are empty."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def show_json(value: Any) -> None:

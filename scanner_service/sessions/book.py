@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 
-from scanner_service.rescan.reference import ReferenceSurface, ReferenceUnusable
-from scanner_service.sessions.calibration import calibration_of, geometry_from, towards_sensor_from
-from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SessionError, SourceUnusable
+from scanner_service.rescan.reference import ReferenceSurface
+from scanner_service.sessions.calibration import calibration_after, calibration_of, geometry_from, towards_sensor_from
+from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SessionError
 from scanner_service.sessions.pass_desk import PassDesk
-from scanner_service.sessions.references import open_reference
+from scanner_service.sessions.references import Nominal, nominal_of
 from scanner_service.sessions.retention import OVER, Kept, Retention, choose
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
@@ -20,7 +20,6 @@ from scanner_service.sessions.source_specs import PushSpec, SourceSpec
 from scanner_service.sessions.sources import PushSource, Source, SpentSource
 from scanner_service.sessions.withdrawals import SERVICE_ENDED
 from scanner_service.storage.errors import RecordError
-from scanner_service.storage.formats.errors import FormatError
 from scanner_service.storage.record import Record, utc_now
 from scanner_service.storage.rows import CreationKey, SessionRow
 
@@ -82,8 +81,8 @@ class SessionBook:
     ) -> LiveSession:
         """Make a session and hold it open; `source` is the opened source when the caller has it already.
 
-        `reference` is the nominal part that the settings name. With a `key` that came before, the session that was
-        made then; nothing is opened or made.
+        `reference` is the nominal part that the settings name, when the caller has it already. With a `key` that came
+        before, the session that was made then; nothing is opened or made.
 
         Raises
         ------
@@ -100,13 +99,20 @@ class SessionBook:
                 raise SessionBusy("the same request is being carried out; ask again in a moment")
             self._creating.add(key.key_sha256)
         try:
-            made = self.record.made_with(key)
-            if made is not None:
-                return self.get(made.session_id)
-            return self._create(name, spec, settings, origin_mm, source, key, reference)
+            return self.made_with(key) or self._create(name, spec, settings, origin_mm, source, key, reference)
         finally:
             with self._lock:
                 self._creating.discard(key.key_sha256)
+
+    def made_with(self, key: CreationKey | None) -> LiveSession | None:
+        """The session that an earlier request with this key made, held open; None when there is none.
+
+        Raises
+        ------
+        CreationKeyReused : the key came before, with another request.
+        """
+        made = None if key is None else self.record.made_with(key)
+        return None if made is None else self.get(made.session_id)
 
     def _create(
         self,
@@ -132,7 +138,9 @@ class SessionBook:
                     calibration=calibration_of(opened),
                     key=key,
                 )
-                session = LiveSession(row, self.record, opened, reference=reference)
+                named = (settings or SessionSettings()).reference
+                nominal = nominal_of(named, self._meshes) if reference is None else Nominal(reference)
+                session = LiveSession(row, self.record, opened, nominal=nominal)
                 session.open()
                 self._live[row.session_id] = session
                 return session
@@ -178,9 +186,12 @@ class SessionBook:
             on_progress(number)
 
         is_push = row.source.get("kind") == PushSpec().to_dict()["kind"]
-        kept = row.calibration
+        kept = calibration_after(row.calibration, self.record.events(row.session_id))
         source: Source = PushSource() if is_push else SpentSource(geometry_from(kept), towards_sensor_from(kept))
-        session = LiveSession(row, self.record, source, reference=self._reference_of(row))
+        nominal = nominal_of(SessionSettings.from_dict(row.settings).reference, self._meshes)
+        if nominal.refused is not None:
+            _LOG.warning("session %s is %s", row.session_id, nominal.refused)
+        session = LiveSession(row, self.record, source, nominal=nominal)
         session.open(taken)
         with self._lock:
             self._live[row.session_id] = session
@@ -276,17 +287,6 @@ class SessionBook:
             for live in self._live.values():
                 stack.callback(live.close)
             self._live = {}
-
-    def _reference_of(self, row: SessionRow) -> ReferenceSurface | None:
-        """The nominal part of a session that is opened again; None when there is none, or not the same any more."""
-        spec = SessionSettings.from_dict(row.settings).reference
-        if spec is None or self._meshes is None:
-            return None
-        try:
-            return open_reference(spec, self._meshes)[0]
-        except (FormatError, ReferenceUnusable, SourceUnusable) as error:
-            _LOG.warning("session %s is opened without its reference mesh: %s", row.session_id, error)
-            return None
 
     def _make_room(self) -> None:
         """Close the session that was opened first among those that do not scan."""

@@ -1,6 +1,6 @@
 """What a session keeps of the scanner that took it, and reads when it is reopened; knows no port."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from drivers.scanline import Float64Array, SensorGeometry
 from scanner_service.sessions.sources import DeviceSource, Source
+from scanner_service.storage.rows import EventRow
 
 
 def calibration_of(source: Source) -> dict[str, Any]:
@@ -43,6 +44,22 @@ def towards_sensor_from(kept: Mapping[str, Any]) -> Float64Array | None:
     """The direction towards the sensor that `calibration_of` kept, (3,); None when there is none."""
     told = kept.get("towards_sensor")
     return None if told is None else np.array(told, dtype=np.float64)
+
+
+CALIBRATED = "calibrated"
+"""The event before a further pass of a session: what `calibration_of` says from here on."""
+
+
+def calibration_after(
+    kept: Mapping[str, Any], events: Iterable[EventRow], lines: int | None = None
+) -> Mapping[str, Any]:
+    """The calibration in force after so many lines of a session (None: all), of which `kept` is the first."""
+    told = [
+        event.details
+        for event in events
+        if event.kind == CALIBRATED and not event.damaged and (lines is None or event.line_number < max(lines, 1))
+    ]
+    return told[-1] if told else kept
 
 
 def _plain(value: Any) -> Any:

@@ -56,10 +56,12 @@ class ExportDesk:
         folder: Path,
         open_reader: Callable[[], RecordReader],
         clock: Callable[[], datetime] = lambda: datetime.now(UTC),
+        meshes: Path | None = None,
     ) -> None:
         self._folder = folder
         self._open_reader = open_reader
         self._clock = clock
+        self._meshes = meshes  # the folder in which reference meshes lie
         self._jobs: dict[str, ExportJob] = {}
         self._lock = threading.Lock()
         self._waiting: queue.Queue[str | None] = queue.Queue()
@@ -152,6 +154,7 @@ class ExportDesk:
                 self._folder / job_id,
                 self._clock(),
                 lambda doing, share: self._tell(job_id, doing=doing, share=share),
+                meshes=self._meshes,
             )
         self._tell(job_id, state="done", doing="", share=1.0, manifest=manifest)
 

@@ -62,12 +62,14 @@ def export_session(
     now: datetime,
     on_progress: OnProgress = lambda what, share: None,
     points_at_once: int = POINTS_AT_ONCE,
+    meshes: Path | None = None,
 ) -> dict[str, Any]:
     """Write a session in the formats asked for, and the manifest of the files; returns the manifest.
 
     Each file appears under its name when it is whole, the manifest last. `on_progress` is told what is being done,
     and the share of it that is done. A session of more than `points_at_once` points is never in memory as a whole:
-    its points are written without a verdict, slab by slab.
+    its points are written without a verdict, slab by slab. `meshes` is the folder with
+    the reference mesh that the session may name.
 
     Raises
     ------
@@ -94,7 +96,7 @@ def export_session(
                 written += _write_points(name, tiled.stream, about, folder, on_progress)
         facts = {"lines": tiled.lines, "points": tiled.stream.total, "damaged_lines": list(tiled.damaged)}
         return write_manifest(folder, written, _facts(about, now) | facts | {"verdict_sha256": None})
-    stored = read_session(reader, row, lambda share: on_progress("reading the record", share), REPORT in wanted)
+    stored = read_session(reader, row, lambda share: on_progress("reading the record", share), REPORT in wanted, meshes)
     results = stored.results
     stream = stream_of(results.snapshot, results.verdict.rescan, results.verdict.reason)
     for name in wanted:
@@ -110,6 +112,7 @@ def export_session(
         "lines": stored.lines,
         "points": len(results.snapshot),
         "damaged_lines": list(stored.damaged),
+        "reference_refused": results.reference_refused,
         "verdict_sha256": verdict_sha256(results),
     }
     return write_manifest(folder, written, _facts(stored.about, now) | facts)

@@ -6,6 +6,7 @@ from scanner_service.analysis.compiling import compile_kernels
 from scanner_service.rescan.passes.compiling import compile_planner
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.results import judge
+from scanner_service.storage.packing import compile_packing
 
 _LOCK = threading.Lock()
 _READY = threading.Event()
@@ -17,9 +18,10 @@ def kernels_are_ready() -> bool:
 
 
 def warm_up() -> None:
-    """Compile every kernel of map, regions and passes, or load it from the cache; at once when that was done."""
+    """Compile every kernel of record, map, regions and passes, or load it from the cache; at once when it was done."""
     with _LOCK:
         if not _READY.is_set():
+            compile_packing()
             snapshot = compile_kernels()
             compile_planner(snapshot, judge(snapshot, Requirement()).report)
             _READY.set()

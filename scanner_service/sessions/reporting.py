@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
@@ -27,7 +28,7 @@ def report_of(stored: StoredSession, now: datetime) -> ReportContent:
     required = results.coverage.required_per_mm2
     required = required[np.isfinite(required)]
     summary = summarise(results, stored.losses, math.nan, stored.about.version)
-    regions = results.report.regions
+    regions = results.regions
     area = sum(region.area_mm2 for region in regions)
     share = results.coverage.share
     return ReportContent(
@@ -46,7 +47,8 @@ def report_of(stored: StoredSession, now: datetime) -> ReportContent:
         fates=fates_of(stored.first, results) if stored.first is not None else (),
         required_per_mm2=float(np.median(required)) if len(required) else math.nan,
         headlines=(
-            ("observed coverage", "unknown" if math.isnan(share) else f"{100 * share:.1f} %"),
+            *_nominal(results),
+            ("observed coverage", _percent(share)),
             ("points", shown(summary["points"])),
             ("scanlines", shown(summary["scanlines"])),
             ("regions to scan again", shown(len(regions))),
@@ -68,12 +70,23 @@ def fates_of(first: Results, last: Results) -> tuple[FateRow, ...]:
             region.area_mm2,
             float(last.report.rescan[region.point_rows].mean()) if len(region.point_rows) else 0.0,
         )
-        for region in first.report.regions
+        for region in first.regions
     )
 
 
 def _verdictful(results: Results) -> Verdictful:
-    return Verdictful(results.snapshot, results.report, results.coverage)
+    return Verdictful(results.snapshot, replace(results.report, regions=results.regions), results.coverage)
+
+
+def _nominal(results: Results) -> tuple[tuple[str, str], ...]:
+    """The coverage of the nominal part, where there is one, or why it is not told."""
+    if results.reference is not None:
+        return (("coverage of the nominal part", _percent(results.reference.share)),)
+    return () if results.reference_refused is None else (("coverage of the nominal part", results.reference_refused),)
+
+
+def _percent(share: float) -> str:
+    return "unknown" if math.isnan(share) else f"{100 * share:.1f} %"
 
 
 def _pass_row(number: int, stage: Stage) -> PassRow:

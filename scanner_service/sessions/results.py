@@ -94,10 +94,14 @@ def judge(
     geometry: SensorGeometry | None = None,
     towards_sensor: Float64Array | None = None,
     reference: ReferenceSurface | None = None,
+    reference_refused: str | None = None,
 ) -> Results:
-    """Find the rescan regions and the coverage of a snapshot; geometry and direction as `find_regions` has them."""
+    """Find the rescan regions and the coverage of a snapshot; geometry and direction as `find_regions` has them.
+
+    `reference_refused` says why there is no reference although one was asked for.
+    """
     report = find_regions(snapshot, requirement, geometry, towards_sensor=towards_sensor)
-    measured, refused = None, None
+    measured, refused = None, reference_refused
     if reference is not None:
         try:
             if check_place(reference, snapshot):

@@ -1,7 +1,8 @@
 """From what a user asks for to a source that can be started: device, file or push; the one place that opens them."""
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ from drivers.rig_limits import PassOrder
 from drivers.running_rig import RunningRig
 from drivers.scanners.native import NativeScanner
 from scanner_service.analysis.passes import pass_key
+from scanner_service.sessions.calibration import calibration_after, geometry_from, towards_sensor_from
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.rig_source import Preparation, RigSource
 from scanner_service.sessions.sources import DeviceSource, PassRequest, PushSource, ReplaySource, Source
 from scanner_service.sessions.withdrawals import withdrawn_passes
+from scanner_service.storage.errors import RecordError
 from scanner_service.storage.formats import ReadOptions, Recording, open_recording
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.rows import SessionRow
@@ -136,6 +139,7 @@ class RecordSpec:
     reader: RecordReader
     session: SessionRow
     speed: float | None = None
+    close: Callable[[], None] = lambda: None
 
     @classmethod
     def find(cls, reader: RecordReader, session_id: str | None, speed: float | None = None) -> "RecordSpec":
@@ -147,14 +151,36 @@ class RecordSpec:
             raise SourceUnusable("the record holds no session to replay")
         return cls(reader, newest[0], speed)
 
+    @classmethod
+    def of_file(cls, file: Path, session_id: str | None, speed: float | None) -> "RecordSpec":
+        """The session of that id, or the newest, of a record in a file, which the source closes when it is played.
+
+        Raises SourceUnusable when there is none, or the file is no record that this version can read.
+        """
+        try:
+            reader = RecordReader.open(file)
+        except RecordError as error:
+            raise SourceUnusable(str(error).replace(str(file.resolve()), file.name)) from error
+        try:
+            return replace(cls.find(reader, session_id, speed), close=reader.close)
+        except BaseException as error:
+            reader.close()
+            if isinstance(error, RecordError):
+                raise SourceUnusable(f"{file.name}: {error}") from error
+            raise
+
     def open(self) -> Source:
         """A source that plays the stored lines as they are, without the passes that were withdrawn.
 
         Raises SourceUnusable.
         """
-        gone = withdrawn_passes(self.reader.events(self.session.session_id))
+        events = list(self.reader.events(self.session.session_id))
+        gone, kept = withdrawn_passes(events), calibration_after(self.session.calibration, events)
         lines = (line for _, line in self.reader.lines(self.session.session_id) if pass_key(line) not in gone)
-        return ReplaySource(lines, self.reader.count(self.session.session_id).lines, None, self.speed)
+        count = self.reader.count(self.session.session_id).lines
+        source = ReplaySource(lines, count, None, self.speed, let_go=self.close)
+        source.geometry, source.towards_sensor = geometry_from(kept), towards_sensor_from(kept)
+        return source
 
     def to_dict(self) -> dict[str, Any]:
         """As it is kept in the record."""

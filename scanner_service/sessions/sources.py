@@ -262,8 +262,9 @@ def tell_scanner_event(event: ScannerEvent, sink: Sink) -> None:
 class ReplaySource:
     """Recorded scanlines, played as fast as they are taken or at `speed` times the pace of their device times.
 
-    `accounts` is what the file held and what of it could not be used, `line_count` how many lines there are. Raises
-    SourceUnusable when `speed` is not a pace.
+    `accounts` is what the file held and what of it could not be used, `line_count` how many lines there are.
+    `let_go` is called, perhaps twice, when no more of them will be read. Raises SourceUnusable when `speed` is not a
+    pace.
     """
 
     def __init__(
@@ -273,6 +274,7 @@ class ReplaySource:
         accounts: dict[str, Any] | None = None,
         speed: float | None = None,
         clock: Callable[[], float] = time.monotonic,
+        let_go: Callable[[], None] = lambda: None,
     ) -> None:
         if speed is not None and not (math.isfinite(speed) and speed > 0):
             raise SourceUnusable(f"the speed of a replay must be greater than 0, not {speed}")
@@ -283,6 +285,7 @@ class ReplaySource:
         self._accounts = accounts
         self._speed = speed
         self._clock = clock
+        self._let_go = let_go
         self._played = 0
         self._going = threading.Event()
         self._going.set()
@@ -299,7 +302,9 @@ class ReplaySource:
         """Stop playing."""
         self._stopping.set()
         self._going.set()
-        if self._thread is not None and self._thread is not threading.current_thread():
+        if self._thread is None:
+            self._let_go()
+        elif self._thread is not threading.current_thread():
             self._thread.join()
 
     def pause(self) -> None:
@@ -340,6 +345,7 @@ class ReplaySource:
         except Exception as error:  # noqa: BLE001 - the thread's loop: the session is told, or it would never end
             _LOG.exception("the replay stopped")
             failure = f"the replay stopped by an internal fault: {error}"
+        self._let_go()
         sink.ended(failure)
 
     def _wait_while_held(self) -> None:

@@ -1,7 +1,8 @@
 """A session as its record tells it: rebuilt, judged and hashed without a service; changes nothing in the record."""
 
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,17 +10,20 @@ import numpy as np
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.live_map import LiveMap
 from scanner_service.analysis.passes import PassKey, pass_key
-from scanner_service.analysis.snapshot import Unreliable
-from scanner_service.sessions.calibration import geometry_from, towards_sensor_from
+from scanner_service.analysis.snapshot import MapSnapshot, Unreliable
+from scanner_service.rescan.followed import RegionBook
+from scanner_service.sessions.calibration import calibration_after, geometry_from, towards_sensor_from
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.fingerprint import RawHash
+from scanner_service.sessions.judgement import REGIONS_FOLLOWED
 from scanner_service.sessions.ledger import Ledger
+from scanner_service.sessions.references import nominal_of
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.withdrawals import ends_of_passes, withdrawn_passes
 from scanner_service.storage.exports.about import About
 from scanner_service.storage.reader import RecordReader
-from scanner_service.storage.rows import SessionRow
+from scanner_service.storage.rows import EventRow, SessionRow
 
 OnShare = Callable[[float], object]
 MOST_STAGES = 12
@@ -78,18 +82,33 @@ def find_session(reader: RecordReader, wanted: str) -> SessionRow:
     ------
     SourceUnusable : there is none, or several begin so; the sentence says which there are.
     """
-    after, begun, seen = None, [], 0
-    while page := reader.list_sessions(100, after):
-        if wanted == "latest":
-            return page[0]
-        seen += len(page)
-        begun += [row for row in page if row.session_id.lower().startswith(wanted.lower())]
-        after = page[-1].session_id
+
+    def rows() -> Iterator[SessionRow]:
+        after = None
+        while page := reader.list_sessions(100, after):
+            yield from page
+            after = page[-1].session_id
+
+    return reader.get_session(named_session((row.session_id for row in rows()), wanted))
+
+
+def named_session(newest_first: Iterable[str], wanted: str) -> str:
+    """Which of the ids is meant: that id, the only one that begins so, or the newest for `latest`.
+
+    Raises
+    ------
+    SourceUnusable : none, or several; the sentence says which there are.
+    """
+    begun, seen = [], 0
+    for session_id in newest_first:
+        if wanted in ("latest", session_id):
+            return session_id
+        seen += 1
+        begun += [session_id] if session_id.lower().startswith(wanted.lower()) else []
     if len(begun) == 1:
         return begun[0]
     if begun:
-        listed = ", ".join(row.session_id for row in begun[:5])
-        raise SourceUnusable(f"{len(begun)} sessions begin with {wanted}: {listed}; give more letters")
+        raise SourceUnusable(f"{len(begun)} sessions begin with {wanted}: {', '.join(begun[:5])}; give more letters")
     raise SourceUnusable(
         f"the record holds no session {wanted}; it holds {seen}, of which `latest` is the newest"
         if seen
@@ -110,9 +129,15 @@ def lines_of(
 
 
 def read_session(
-    reader: RecordReader, row: SessionRow, on_share: OnShare = lambda share: None, with_stages: bool = False
+    reader: RecordReader,
+    row: SessionRow,
+    on_share: OnShare = lambda share: None,
+    with_stages: bool = False,
+    meshes: Path | None = None,
 ) -> StoredSession:
     """Rebuild a session from its lines as a service does that opens it again, and judge it.
+
+    `meshes` is the folder with the reference mesh that the session may name.
 
     Raises
     ------
@@ -120,7 +145,7 @@ def read_session(
     AnalysisError : the lines do not fit the map that the settings describe.
     """
     settings = SessionSettings.from_dict(row.settings)
-    geometry, towards_sensor = geometry_from(row.calibration), towards_sensor_from(row.calibration)
+    nominal = nominal_of(settings.reference, meshes)
     events = list(reader.events(row.session_id))
     withdrawn, scan_ends = withdrawn_passes(events), ends_of_passes(events)
     live_map = LiveMap(settings.map_settings(), np.array(row.origin_mm))
@@ -131,6 +156,13 @@ def read_session(
     ends = pass_ends(reader, row, withdrawn) if with_stages else []
     kept = set(_evenly(ends[:-1], MOST_STAGES - 1))
     open_passes: dict[str, PassKey] = {}
+
+    def judged(snapshot: MapSnapshot, lines: int | None = None) -> Results:
+        """The verdict on a snapshot, by what was known of the scanner after so many lines."""
+        kept = calibration_after(row.calibration, events, lines)
+        geometry, towards_sensor = geometry_from(kept), towards_sensor_from(kept)
+        return judge(snapshot, settings.requirement(), geometry, towards_sensor, nominal.surface, nominal.refused)
+
     try:
         for number, line in lines_of(reader, row, damaged, on_share):
             while scan_ends and scan_ends[0] <= number:
@@ -142,7 +174,7 @@ def read_session(
                 if over in withdrawn:  # at once, so that no stage tells of it
                     ledger.withdrawn(live_map.withdraw_pass(over))
                 if raw.lines in kept:
-                    found = judge(live_map.snapshot(), settings.requirement(), geometry, towards_sensor)
+                    found = judged(live_map.snapshot(), number)
                     stages.append(_stage((over,), raw.lines, found))
                     first = first or found
             open_passes[line.device_id] = pass_key(line)
@@ -153,9 +185,11 @@ def read_session(
             if points := live_map.withdraw_pass(key):
                 ledger.withdrawn(points)
         ledger.received = ledger.stored = raw.lines
-        results = judge(live_map.snapshot(), settings.requirement(), geometry, towards_sensor)
+        snapshot = live_map.snapshot()
     finally:
         live_map.close()
+        del live_map  # judging needs as much memory as the map, and the map no more
+    results = _followed(judged(snapshot), events)
     last = tuple(key for key in open_passes.values() if key not in withdrawn)
     return StoredSession(
         row=row,
@@ -169,6 +203,14 @@ def read_session(
         damaged=tuple(damaged),
         losses=_recorded_losses(reader, row) or ledger.to_dict(None),
     )
+
+
+def _followed(results: Results, events: Iterable[EventRow]) -> Results:
+    """The results, their regions with the ids and the history that the scan left in the record."""
+    kept = [event.details for event in events if event.kind == REGIONS_FOLLOWED and not event.damaged]
+    book = RegionBook.from_dict(kept[-1]) if kept else RegionBook()
+    book.follow(results.snapshot, results.regions)
+    return replace(results, regions=book.current, resolved=book.resolved)
 
 
 def pass_ends(reader: RecordReader, row: SessionRow, withdrawn: Collection[PassKey]) -> list[int]:
@@ -192,7 +234,7 @@ def _evenly(values: list[int], most: int) -> list[int]:
 
 
 def _stage(passes: tuple[PassKey, ...], lines: int, found: Results) -> Stage:
-    regions = found.report.regions
+    regions = found.regions
     return Stage(
         passes=passes,
         lines=lines,

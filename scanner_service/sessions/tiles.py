@@ -26,6 +26,7 @@ from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.rows import SessionRow
 
 POINTS_AT_ONCE = 10_000_000
+_SLAB_POINTS = 4_000_000
 _BIN_Q = 1 << 13  # a slab ends at a whole millimetre
 _NO_XYZ, _NO_INDEX = np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
 
@@ -88,7 +89,7 @@ def read_in_tiles(
     margin_mm = max([head.radius_mm for head in heads] + [20.0 * settings.uncertainty_mm])
     margin_q = math.ceil(margin_mm / QUANTUM_MM) + 1
     axis = max(range(3), key=lambda one: len(bins[one]))
-    slabs = _slabs(bins[axis], -(-margin_q // _BIN_Q), points_at_once)
+    slabs = _slabs(bins[axis], -(-margin_q // _BIN_Q), min(points_at_once, _SLAB_POINTS))
 
     def blocks() -> Iterator[PointBlock]:
         for first_bin, end_bin, most in slabs:

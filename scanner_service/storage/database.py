@@ -21,7 +21,9 @@ from scanner_service.storage.tables import APPLICATION_ID, SCHEMA_VERSION, metad
 
 OLDEST_SQLITE = (3, 37, 0)
 PAGE_BYTES = 8192
+_MAGIC = b"SQLite format 3\0"
 _USER_VERSION, _APPLICATION = slice(60, 64), slice(68, 72)  # places in the header of an SQLite file
+_IS_ODD = "type NOT IN ('table', 'index') OR sql LIKE '%VIRTUAL%' OR sql LIKE '%GENERATED%' OR sql LIKE '% AS (%'"
 _WRITER_WAITS_S = 0.2
 _READER_WAITS_S = 5.0
 
@@ -128,10 +130,23 @@ def check_identity(connection: sqlite3.Connection, path: Path) -> int:
     try:
         application = connection.execute("PRAGMA application_id").fetchone()[0]
         version = connection.execute("PRAGMA user_version").fetchone()[0]
+        connection.execute("PRAGMA trusted_schema=0")
+        odd = connection.execute("SELECT count(*) FROM sqlite_master WHERE " + _IS_ODD).fetchone()[0]
     except sqlite3.DatabaseError as error:
         raise NotARecord(f"{path} cannot be opened as a record: {error}; choose another file") from error
     _check_marks(application, version, path)
+    if odd:  # a view or a computed column in the place of a table runs whatever its author wanted
+        raise NotARecord(f"{path} has views, triggers or computed columns, as no record has; choose another file")
     return int(version)
+
+
+def is_sqlite(path: Path) -> bool:
+    """True for a file that begins as SQLite's do; whether it is a record is told by whoever opens it."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_MAGIC)) == _MAGIC
+    except OSError:
+        return False
 
 
 def check_file(path: Path) -> None:
@@ -142,7 +157,7 @@ def check_file(path: Path) -> None:
     """
     with path.open("rb") as file:
         header = file.read(100)
-    ours = header.startswith(b"SQLite format 3\0") and header[_APPLICATION] == struct.pack(">I", APPLICATION_ID)
+    ours = header.startswith(_MAGIC) and header[_APPLICATION] == struct.pack(">I", APPLICATION_ID)
     log = path.with_name(path.name + "-wal")
     if not ours and log.is_file() and log.stat().st_size > 0:
         return  # a first page torn by a power cut is mended from the log: whoever connects checks again

@@ -1,7 +1,8 @@
 """A stored line as bytes and back, bit for bit; knows no table, no checksum and no file.
 
-Format 1, little endian, no padding (`docs/record.md` has it as a table): a fixed header; the device id; the dropped
-places by reason; the index, as runs of consecutive places or raw, whichever is shorter; the coordinates.
+Little endian, no padding (`docs/record.md` has it as a table): a fixed header; the device id; the dropped places by
+reason; the index, as runs of consecutive places or raw, whichever is shorter; the coordinates, in format 1 as they are,
+in format 2 packed. Lines are stored in format 2; format 1 is read, and is what the hash of raw lines is made of.
 """
 
 import struct
@@ -12,8 +13,11 @@ import numpy.typing as npt
 
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.storage.errors import LineDamaged, NotStorable
+from scanner_service.storage.packing import pack, unpack
 
-FORMAT_VERSION = 1
+PLAIN, PACKED = 1, 2
+"""Formats of a line."""
+
 _MAGIC = b"SL"
 _INDEX_RAW = 0
 _INDEX_RUNS = 1
@@ -24,8 +28,8 @@ _REASON = struct.Struct("<HQ")
 _INT64 = range(-(2**63), 2**63)
 
 
-def encode_line(line: StoredLine) -> bytes:
-    """The line as bytes, from which `decode_line` makes the same line, NaN payloads included.
+def encode_line(line: StoredLine, version: int = PACKED) -> bytes:
+    """The line as bytes in a format, from which `decode_line` makes the same line, NaN payloads included.
 
     Raises
     ------
@@ -44,14 +48,15 @@ def encode_line(line: StoredLine) -> bytes:
     coding, words = _encode_index(index)
     try:
         header = _HEADER.pack(
-            *(_MAGIC, FORMAT_VERSION, coding, line.boot_id, line.pass_index, line.line_index),
+            *(_MAGIC, version, coding, line.boot_id, line.pass_index, line.line_index),
             *(line.device_time_s, line.position_mm, line.line_spacing_mm, line.step_mm, b"".join(vectors)),
             *(line.point_count, len(index), len(words), len(line.dropped), len(device)),
         )
         reasons = [_reason(reason, count) for reason, count in line.dropped.items()]
     except struct.error as error:
         raise NotStorable(f"line {line.line_index} of {line.device_id} does not fit the record: {error}") from error
-    return b"".join((header, device, *reasons, words.tobytes(), points.astype("<i4", copy=False).tobytes()))
+    coordinates = points.astype("<i4", copy=False).data if version == PLAIN else pack(points)
+    return b"".join((header, device, *reasons, words.data, coordinates))
 
 
 def decode_line(encoded: bytes) -> StoredLine:
@@ -66,8 +71,8 @@ def decode_line(encoded: bytes) -> StoredLine:
         raise LineDamaged(f"{len(encoded)} bytes are too few for a line")
     magic, version, coding, boot_id, pass_index, line_index, *rest = _HEADER.unpack_from(encoded)
     time_s, position_mm, spacing_mm, step_mm, vectors, places, count, words, reasons, device_bytes = rest
-    if magic != _MAGIC or version != FORMAT_VERSION or coding not in (_INDEX_RAW, _INDEX_RUNS):
-        raise LineDamaged(f"not a line of format {FORMAT_VERSION}: {encoded[:4].hex(' ')}")
+    if magic != _MAGIC or version not in (PLAIN, PACKED) or coding not in (_INDEX_RAW, _INDEX_RUNS):
+        raise LineDamaged(f"not a line of format {PLAIN} or {PACKED}: {encoded[:4].hex(' ')}")
     place = _HEADER.size + device_bytes
     try:
         device_id = encoded[_HEADER.size : place].decode()
@@ -78,10 +83,14 @@ def decode_line(encoded: bytes) -> StoredLine:
             dropped[encoded[place - length : place].decode()] = number
     except (UnicodeDecodeError, struct.error) as error:
         raise LineDamaged(f"the text fields of the line are damaged: {error}") from error
-    if len(encoded) != place + 4 * words + 12 * count:
+    rest_bytes = len(encoded) - place - 4 * words
+    if rest_bytes < 0 or (version == PLAIN and rest_bytes != 12 * count):
         raise LineDamaged(f"{len(encoded)} bytes, but the header tells of {place + 4 * words + 12 * count}")
+    if version == PLAIN:
+        xyz_q = np.frombuffer(encoded, "<i4", 3 * count, place + 4 * words).astype(np.int32).reshape(count, 3)
+    else:
+        xyz_q = unpack(memoryview(encoded)[place + 4 * words :], count)
     index = _decode_index(coding, np.frombuffer(encoded, "<i4", words, place), count)
-    xyz_q = np.frombuffer(encoded, "<i4", 3 * count, place + 4 * words).astype(np.int32).reshape(count, 3)
     laser_mm, plane_normal, travel = np.frombuffer(vectors, "<f8").astype(np.float64).reshape(3, 3)
     return StoredLine(
         device_id=device_id,
@@ -104,12 +113,21 @@ def decode_line(encoded: bytes) -> StoredLine:
 
 def _encode_index(index: npt.NDArray[np.int32]) -> tuple[int, npt.NDArray[np.int32]]:
     """The index as (first, length) of its runs of consecutive places, or as it is where that is shorter."""
+    if _is_one_run(index):  # nearly every line, and several times faster to tell than to look for runs
+        return _INDEX_RUNS, np.array((index[0], len(index)), dtype="<i4")
     steps = index[1:].astype(np.int64) - index[:-1]
     starts = np.concatenate([np.zeros(min(len(index), 1), dtype=np.int64), np.flatnonzero(steps != 1) + 1])
     if 2 * len(starts) >= len(index):
         return _INDEX_RAW, index.astype("<i4", copy=False)
     lengths = np.append(starts[1:], len(index)) - starts
     return _INDEX_RUNS, np.stack((index[starts], lengths), axis=1).astype("<i4").ravel()
+
+
+def _is_one_run(index: npt.NDArray[np.int32]) -> bool:
+    """True for more than two places that follow each other; a step that overflows shows at the last place."""
+    if len(index) < 3 or int(index[-1]) - int(index[0]) != len(index) - 1:
+        return False
+    return bool((index[1:] - index[:-1] == 1).all())
 
 
 def _decode_index(coding: int, words: npt.NDArray[np.int32], count: int) -> npt.NDArray[np.int32]:

@@ -1,6 +1,9 @@
 """What a person does with a session: pauses, resumes, reopens, annotates, deletes it; and what the laser does then."""
 
+import contextlib
 import json
+import shutil
+import sqlite3
 import time
 
 import numpy as np
@@ -10,8 +13,15 @@ import websockets.sync.client
 from typer.testing import CliRunner
 
 from scanner_service.cli import app
+from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.fingerprint import verdict_sha256
+from scanner_service.sessions.settings import SessionSettings
+from scanner_service.sessions.source_specs import PushSpec
+from scanner_service.sessions.sources import ReplaySource
+from scanner_service.storage.record import Record
 from tests.end_to_end.running import wait_for
 from tests.end_to_end.test_live_scan import device, live_client, read_ply
+from tests.unit.analysis.scans import surface_scan
 
 
 def account_of(status):
@@ -135,6 +145,90 @@ def test_a_creation_that_is_sent_again_makes_no_second_session_also_after_a_rest
     )
 
 
+def test_a_creation_that_is_sent_again_is_answered_when_its_file_is_gone(running, tmp_path):
+    service = running.service()
+    scan = service.data / "replay" / "scan.csv"
+    scan.write_text("line,x_mm,y_mm,z_mm\n" + "".join(f"{n},{x},{n},0\n" for n in range(3) for x in range(5)))
+    asked = {"name": "gone", "source": {"kind": "replay", "file": "scan.csv", "laser_mm": [2, 1, 90]}}
+    key = {"Idempotency-Key": "once"}
+    first = service.client.post("/api/v1/sessions", json=asked, headers=key)
+    assert first.status_code == 201, first.text
+    scan.unlink()
+    again = service.client.post("/api/v1/sessions", json=asked, headers=key)
+    assert (again.status_code, again.json()["id"]) == (201, first.json()["id"])
+    assert service.client.post("/api/v1/sessions", json=asked).status_code == 422
+
+
+def test_a_record_file_is_replayed_over_rest_with_its_own_settings_and_verdict(running, tmp_path):
+    service = running.service()
+    path = tmp_path / "made.sqlite"
+    with Record.open(path) as record:
+        book = SessionBook(record)
+        lines = surface_scan(lambda x, y: 0.1 * x, lines=12)
+        settings = SessionSettings(max_points=5000, noise_mm=0.02)
+        made = book.create("made", PushSpec(), settings, (1.0, 2.0, 3.0), ReplaySource(lines, len(lines)))
+        made.start()
+        assert made.wait_until_over(60)
+        verdict = verdict_sha256(made.results())
+        book.close()
+    shutil.copy(path, service.data / "replay" / "made.sqlite")
+    (service.data / "replay" / "other.sqlite").write_bytes(b"SQLite format 3\0" + bytes(84))
+    with contextlib.closing(sqlite3.connect(service.data / "replay" / "views.sqlite")) as views:
+        shutil.copy(path, service.data / "replay" / "views.sqlite")
+        views.executescript("ALTER TABLE lines RENAME TO hidden; CREATE VIEW lines AS SELECT * FROM hidden")
+    session_id = service.create(kind="replay", file="made.sqlite")
+    service.start(session_id)
+    service.wait_for_state(session_id, "stopped")
+    status = service.status(session_id)
+    assert (status["lines"], status["origin_mm"]) == (12, [1.0, 2.0, 3.0])
+    assert status["settings"] == settings.to_dict()
+    told = service.client.get(f"/api/v1/sessions/{session_id}/summary")
+    assert told.json()["verdict_sha256"] == verdict
+    for source, why in (
+        ({"file": "other.sqlite"}, "other.sqlite cannot be opened as a record"),
+        ({"file": "views.sqlite"}, "views"),
+        ({"file": "made.sqlite", "session": "nobody"}, "no session"),
+        ({"file": "made.sqlite", "units": "mm"}, "leave them out"),
+    ):
+        refused = service.client.post("/api/v1/sessions", json={"source": {"kind": "replay", **source}})
+        assert refused.status_code == 422 and why in refused.json()["detail"], refused.text
+        assert str(service.data) not in refused.text
+    refused = service.client.post(
+        "/api/v1/sessions", json={"source": {"kind": "replay", "file": "made.sqlite"}, "origin_mm": [0, 0, 0]}
+    )
+    assert refused.status_code == 422 and "own settings" in refused.json()["detail"]
+
+
+def test_a_file_is_brought_over_rest_played_and_removed(running):
+    service = running.service()
+    scan = b"line,x_mm,y_mm,z_mm,laser_x_mm,laser_y_mm,laser_z_mm\n"
+    scan += b"".join(b"%d,%d,%d,0,2,%d,90\n" % (n, x, n, n) for n in range(4) for x in range(5))
+    brought = service.client.put("/api/v1/files/my scan.csv", content=scan)
+    assert (brought.status_code, brought.json()) == (
+        201,
+        {"name": "my scan.csv", "bytes": len(scan), "kind": "csv profiles"},
+    )
+    assert service.client.get("/api/v1/files").json()["files"] == [brought.json()]
+    session_id = service.create(kind="replay", file="my scan.csv")
+    service.start(session_id)
+    service.wait_for_state(session_id, "stopped")
+    assert service.status(session_id)["lines"] == 4
+    refused = service.client.put("/api/v1/files/my scan.csv", content=scan + b"4,0,4,0,2,4,90\n")
+    assert refused.status_code == 422 and "another file" in refused.json()["detail"]
+    assert service.client.put("/api/v1/files/x.bin", content=bytes(99)).status_code == 422
+    assert service.client.put("/api/v1/files/..%2Fx.csv", content=scan).status_code in (400, 404, 422)
+    assert service.client.delete("/api/v1/files/my scan.csv").status_code == 204
+    assert service.client.get("/api/v1/files").json()["files"] == []
+    assert service.status(session_id)["lines"] == 4
+
+
+def test_a_command_that_fails_leaves_no_empty_folder(tmp_path):
+    out = tmp_path / "a" / "b"
+    done = CliRunner().invoke(app, ["export", "latest", "--record", str(tmp_path / "none.sqlite"), "--out", str(out)])
+    assert done.exit_code == 1 and "there is no record" in done.output
+    assert not any(tmp_path.iterdir())
+
+
 def test_the_command_line_does_what_the_service_does(running):
     service, simulator = running.service(), running.simulator("plate")
     session_id = service.create(**device(simulator))
@@ -145,7 +239,7 @@ def test_the_command_line_does_what_the_service_does(running):
         assert done.exit_code == 0, done.output
         return done.output
 
-    run("start", session_id)
+    run("start", session_id[:10])
     wait_for(lambda: service.status(session_id)["lines"] > 5, "some lines")
     assert run("pause", session_id).startswith("paused")
     assert run("resume", session_id).startswith("scanning")
@@ -161,7 +255,7 @@ def test_the_command_line_does_what_the_service_does(running):
     run("delete", session_id, "--yes")
     gone = runner.invoke(app, ["sessions", "show", session_id, *where])
     assert gone.exit_code == 1
-    assert "there is no session" in gone.output
+    assert "holds no session" in gone.output
 
 
 def test_points_and_ledger_are_the_same_after_push_stop_start_and_push_to_the_same_pass(running):

@@ -1,5 +1,6 @@
 """The viewer in a real browser before the real service: simulator process, pty, driver, service, WebSocket, page."""
 
+import base64
 import io
 import json
 import subprocess
@@ -14,8 +15,14 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.settings import SessionSettings
+from scanner_service.sessions.source_specs import PushSpec
+from scanner_service.sessions.sources import ReplaySource
+from scanner_service.storage.record import Record
 from tests.end_to_end.browsing import NEEDS_CHROMIUM, Page, chromium, wait
 from tests.end_to_end.running import ROOT
+from tests.unit.analysis.scans import surface_scan
 
 pytestmark = NEEDS_CHROMIUM
 
@@ -208,3 +215,37 @@ def test_the_page_starts_a_session_misses_a_service_that_ends_and_finds_it_again
         finally:
             again.terminate()
     page.tab.close()
+
+
+def test_a_record_that_is_dropped_on_the_page_is_played_and_shown(running: Any, context: Any, tmp_path: Path) -> None:
+    path = tmp_path / "brought.sqlite"
+    with Record.open(path) as record:
+        book = SessionBook(record)
+        lines = surface_scan(lambda x, y: 0.2 * np.sin(x), lines=30, points=60)
+        made = book.create("brought", PushSpec(), SessionSettings(max_points=9000), source=ReplaySource(lines, 30))
+        made.start()
+        assert made.wait_until_over(60)
+        book.close()
+    service = running.service()
+    page = viewer_page(context, service)
+    page.until("document.querySelector('#notice').textContent.startsWith('No session yet')")
+    drop = """([name, base64]) => {
+      const bytes = Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+      const carried = new DataTransfer();
+      carried.items.add(new File([bytes], name));
+      const event = { dataTransfer: carried, bubbles: true, cancelable: true };
+      for (const kind of ["dragover", "drop"]) document.body.dispatchEvent(new DragEvent(kind, event));
+    }"""
+    page.tab.evaluate(drop, ["brought.sqlite", base64.b64encode(path.read_bytes()).decode()])
+    page.until("viewer.connection === 'finished' && viewer.points === 1800")
+    assert page.text("#session-name") == "brought.sqlite"
+    shown = page.tab.evaluate("viewer.session")
+    assert service.status(shown)["source"] == {"kind": "record", "session": made.row.session_id}
+    assert [file["kind"] for file in service.client.get("/api/v1/files").json()["files"]] == ["record"]
+    assert page.complaints == []
+    odd = tmp_path / "odd.txt"
+    odd.write_bytes(bytes(64))
+    page.tab.set_input_files("#file", odd)
+    page.until("document.querySelector('#message').textContent.includes('none of the kinds that are read')")
+    assert [complaint for complaint in page.complaints if "422" not in complaint] == []
+    assert page.tab.evaluate("viewer.session") == shown

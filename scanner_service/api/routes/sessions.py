@@ -29,7 +29,9 @@ from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.references import open_reference
 from scanner_service.sessions.session import LiveSession
-from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, ReplaySpec, RigSpec, SourceSpec
+from scanner_service.sessions.settings import SessionSettings
+from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec, ReplaySpec, RigSpec, SourceSpec
+from scanner_service.storage.database import is_sqlite
 from scanner_service.storage.formats.recording import ReadOptions
 from scanner_service.storage.rows import SessionRow
 
@@ -64,6 +66,12 @@ def spec_of(source: DeviceSourceIn | RigSourceIn | ReplaySourceIn | PushSourceIn
         case ReplaySourceIn():
             if source.file not in {item.name for item in replay_dir.iterdir()}:
                 raise SourceUnusable(f"there is no file {source.file} in the service's replay folder")
+            if is_sqlite(replay_dir / source.file):
+                if (source.units, source.laser_mm, source.line_spacing_mm) != (None, None, None):
+                    raise SourceUnusable("a record knows its units, spacing and laser: leave them out")
+                return RecordSpec.of_file(replay_dir / source.file, source.session, source.speed)
+            if source.session is not None:
+                raise SourceUnusable(f"{source.file} is no record, so that it holds no session to be named")
             options = ReadOptions(units=source.units, laser_mm=source.laser_mm, line_spacing_mm=source.line_spacing_mm)
             return ReplaySpec(replay_dir / source.file, options, source.speed)
         case PushSourceIn():
@@ -151,14 +159,25 @@ def create_session(
     With an `Idempotency-Key` the request may be sent again: the answer is then about the session made at first.
     """
     key = creation_key(idempotency_key, who, body)
+    made = book_of(request).made_with(key)
+    if made is not None:  # whatever has become of the files that the request names
+        return _made(made)
     spec = spec_of(body.source, request.app.state.service.replay_dir)
-    settings, reference = body.settings.to_settings(), None
-    if settings.reference is not None:
+    settings, reference, origin_mm = body.settings.to_settings(), None, body.origin_mm
+    if isinstance(spec, RecordSpec):
+        if body.model_fields_set & {"settings", "origin_mm"}:
+            spec.close()
+            raise SourceUnusable("a session of a record is played with its own settings and origin: leave them out")
+        settings, origin_mm = SessionSettings.from_dict(spec.session.settings), spec.session.origin_mm
+    elif settings.reference is not None:
         reference, named = open_reference(settings.reference, request.app.state.service.replay_dir)
         settings = replace(settings, reference=named)
-    session = book_of(request).create(body.name, spec, settings, body.origin_mm, key=key, reference=reference)
-    location = {"Location": f"/api/v1/sessions/{session.row.session_id}"}
-    return answer(status_answer(session), 201, location)
+    session = book_of(request).create(body.name, spec, settings, origin_mm, key=key, reference=reference)
+    return _made(session)
+
+
+def _made(session: LiveSession) -> Response:
+    return answer(status_answer(session), 201, {"Location": f"/api/v1/sessions/{session.row.session_id}"})
 
 
 @router.get("/{session_id}", dependencies=[viewer])

@@ -103,9 +103,18 @@ def rasterise(snapshot: MapSnapshot, view: View, pixels: int) -> DensityRaster:
 
 
 def _spacing(snapshot: MapSnapshot) -> float:
-    """The larger of line and point spacing, as a typical line has it; 1 mm where neither is known."""
+    """The larger of line and point spacing, as a typical line has it; 1 mm where neither is known.
+
+    A plain cloud is one line with no other beside it: there a typical point tells, by how many share its neighbourhood.
+    """
     lines = snapshot.lines
-    per_line = np.fmax(lines.line_spacing_mm, lines.point_spacing_mm)
+    if len(lines) == 1:
+        told = (snapshot.radius_mm > 0) & (snapshot.neighbours > 1)
+        if told.any():
+            return float(np.median(snapshot.radius_mm[told] * np.sqrt(np.pi / snapshot.neighbours[told])))
+        per_line = lines.point_spacing_mm
+    else:
+        per_line = np.fmax(lines.line_spacing_mm, lines.point_spacing_mm)
     per_line = per_line[np.isfinite(per_line) & (per_line > 0)]
     return float(np.median(per_line)) if len(per_line) else 1.0
 

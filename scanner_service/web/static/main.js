@@ -1,5 +1,6 @@
 // Puts the page together: which part is told what, and when; every rule lives in the part that it calls.
 
+import { FileBringer } from "./bringing.js";
 import { SCALES } from "./colours.js";
 import { byId, element } from "./element.js";
 import { ExportMenu } from "./exports.js";
@@ -39,6 +40,17 @@ view.scene.add(cloud.object, overlay.group);
 const passes = new PassesPanel(trouble, () => session.open(session.id));
 const exports = new ExportMenu(byId("export-links"), byId("exports"));
 const picker = new SessionPicker({ onChoose: openSession, onMissing: (text) => notice(text), current: () => session.id });
+new FileBringer({
+  onSession: (made) => {
+    byId("sessions").close();
+    openSession(made);
+  },
+  onNews: (text) => (text ? notice(text) : explainEmptiness()),
+  onRefusal: (text) => {
+    byId("sessions").close();
+    trouble(text);
+  },
+});
 
 function openView() {
   try {

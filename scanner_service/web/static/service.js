@@ -28,6 +28,23 @@ const sessionPath = (id, rest) => `api/v1/sessions/${encodeURIComponent(id)}/${r
 // {sessions, next}: one page of sessions; `next` goes into `after` for the following page, null when there is none.
 export const listSessions = (after = null) => answer(`api/v1/sessions${after === null ? "" : `?after=${encodeURIComponent(after)}`}`);
 
+export const createSession = (name, source) => send("api/v1/sessions", { name, source });
+
+// Brings a file to the service; `onShare` hears how much of it is there, from 0 to 1. {name, bytes, kind}.
+export function bringFile(file, onShare) {
+  const sent = new XMLHttpRequest(); // fetch does not tell how far it is
+  return new Promise((resolve, reject) => {
+    sent.open("PUT", address(`api/v1/files/${encodeURIComponent(file.name)}`));
+    sent.responseType = "json";
+    sent.setRequestHeader("accept", "application/json");
+    sent.setRequestHeader("content-type", "application/octet-stream");
+    sent.upload.addEventListener("progress", (event) => onShare(event.total ? event.loaded / event.total : 0));
+    sent.addEventListener("error", () => reject(new ServiceRefusal(0, "The service ended the transfer: the file may be too large, or it is not running.")));
+    sent.addEventListener("load", () => (sent.status < 300 ? resolve(sent.response) : reject(new ServiceRefusal(sent.status, sent.response?.detail ?? sent.response?.title ?? `The service answered ${sent.status}.`))));
+    sent.send(file);
+  });
+}
+
 export const startSession = (id) => answer(sessionPath(id, "start"), { method: "POST" });
 
 export const stopSession = (id) => answer(sessionPath(id, "stop"), { method: "POST" });

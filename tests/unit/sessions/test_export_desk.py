@@ -82,7 +82,7 @@ def test_no_more_wait_than_are_allowed(desk, session, monkeypatch):
 
     go_on = threading.Event()
     monkeypatch.setattr(
-        "scanner_service.sessions.export_desk.export_session", lambda *_: go_on.wait(30) and {"files": {}}
+        "scanner_service.sessions.export_desk.export_session", lambda *_, **__: go_on.wait(30) and {"files": {}}
     )
     for _ in range(MOST_WAITING):
         desk.order(session[1], ["ply"])

@@ -1,28 +1,39 @@
 """A session written out tells the truth of the record, and goes elsewhere without losing a bit."""
 
 import json
+import struct
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 
+from drivers.scanline import SensorGeometry
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.exporting import FORMATS, RECORD_FILE, export_session
 from scanner_service.sessions.fingerprint import raw_sha256, verdict_sha256
+from scanner_service.sessions.references import open_reference
+from scanner_service.sessions.reporting import report_of
 from scanner_service.sessions.settings import SessionSettings
-from scanner_service.sessions.source_specs import PushSpec, RecordSpec
+from scanner_service.sessions.source_specs import PushSpec, RecordSpec, ReplaySpec
 from scanner_service.sessions.sources import ReplaySource
 from scanner_service.sessions.stored import find_session, pass_ends, read_session
 from scanner_service.storage.exports.errors import ExtraMissing, FormatNotWritten, NotExportable
 from scanner_service.storage.exports.manifest import verify_folder
+from scanner_service.storage.exports.report_html import report_html
+from scanner_service.storage.exports.report_pdf import report_pdf
 from scanner_service.storage.formats import open_cloud, open_recording
+from scanner_service.storage.formats.recording import ReadOptions
+from scanner_service.storage.formats.reference_mesh import ReferenceSpec
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
 from tests.unit.analysis.scans import surface_scan
+from tests.unit.rescan.test_reference import block
 from tests.unit.storage.record_lines import bits
 
 SETTINGS = SessionSettings(max_points=20_000)
+OPTICS = SensorGeometry(np.array([0.0, 0.0, 90.0]), np.array([30.0, 0.0, 90.0]), (-9.0, 9.0), 0.01)
 NOW = datetime(2026, 11, 26, 9, 0, tzinfo=UTC)
 
 
@@ -102,8 +113,6 @@ def test_what_was_said_live_is_said_again_of_the_record_of_its_copy_and_of_a_rep
 
 
 def test_the_hash_of_a_verdict_sees_the_last_bit(scanned):
-    from dataclasses import replace
-
     results = read(scanned[0]).results
     normals = results.snapshot.normals.copy()
     at = np.flatnonzero(results.snapshot.reliable)[0]
@@ -157,6 +166,81 @@ def test_stages_tell_what_was_known_after_each_pass(scanned):
     assert stored.first is not None
     assert len(stored.first.snapshot) == 14 * 40
     assert stored.stages[0].points < stored.stages[1].points
+
+
+def test_a_session_scanned_from_several_sides_is_judged_the_same_live_reopened_and_exported(tmp_path):
+    lines = two_passes()
+    path = tmp_path / "record.sqlite"
+
+    def source_of(part, towards):
+        source = ReplaySource(part, len(part))
+        source.geometry, source.towards_sensor = OPTICS, np.array(towards)
+        return source
+
+    with Record.open(path) as record:
+        book = SessionBook(record)
+        spec = ReplaySpec(tmp_path / "scan.ply", ReadOptions())
+        session = book.create("sides", spec, SETTINGS, source=source_of(lines[:14], [0.0, 0.0, 1.0]))
+        session.start()
+        assert session.wait_until_over(60)
+        after_one = verdict_sha256(session.results())
+        session.carry_out(lambda: source_of(lines[14:], [0.0, 0.6, 0.8]))
+        assert session.wait_until_over(60)
+        live = session.fresh_results()
+        book.close()
+    with Record.open(path) as record:
+        book = SessionBook(record)
+        reopened = book.get(session.row.session_id)
+        assert reopened.source.towards_sensor is None
+        again = reopened.fresh_results()
+        book.close()
+    stored = read(path, with_stages=True)
+    assert verdict_sha256(again) == verdict_sha256(live) == verdict_sha256(stored.results)
+    assert verdict_sha256(stored.first) == after_one
+    assert stored.row.calibration["towards_sensor"] == [0.0, 0.0, 1.0]
+    told = [
+        [(region.region_id, region.area_mm2) for region in found.regions] for found in (live, again, stored.results)
+    ]
+    assert told[0] == told[1] == told[2] and told[0]
+
+
+def test_a_reference_mesh_is_in_verdict_and_report_or_said_to_be_missing(tmp_path):
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    corners = (block((8.0, 8.0, 1.0)) - [4.0, 1.0, 0.0]).astype("<f4")
+    triangles = b"".join(bytes(12) + corner.tobytes() + bytes(2) for corner in corners)
+    (meshes / "nominal.stl").write_bytes(bytes(80) + struct.pack("<I", len(corners)) + triangles)
+    surface, named = open_reference(ReferenceSpec("nominal.stl"), meshes)
+    settings = replace(SETTINGS, reference=named)
+    lines = two_passes()
+    path = tmp_path / "record.sqlite"
+    with Record.open(path) as record:
+        book = SessionBook(record, meshes=meshes)
+        source = ReplaySource(lines, len(lines))
+        session = book.create("nominal", PushSpec(), settings, source=source, reference=surface)
+        session.start()
+        assert session.wait_until_over(60)
+        live = session.results()
+        book.close()
+    assert live.reference is not None
+    stored = read(path, meshes=meshes)
+    assert stored.results.share == live.share
+    assert stored.results.regions_dict()["regions"] == live.regions_dict()["regions"]
+    assert {region.reason.label for region in stored.results.regions} >= {"untouched"}
+    without = read(path)
+    assert verdict_sha256(stored.results) == verdict_sha256(live) != verdict_sha256(without.results)
+    assert "without the reference mesh" in without.results.reference_refused
+    content = report_of(stored, NOW)
+    assert dict(content.headlines)["coverage of the nominal part"] == f"{100 * live.share:.1f} %"
+    assert b"untouched" in report_html(content)
+    assert report_pdf(content)
+    (meshes / "nominal.stl").unlink()
+    with Record.open(path) as record:
+        book = SessionBook(record, meshes=meshes)
+        reopened = book.get(session.row.session_id)
+        assert reopened.fresh_results().reference is None
+        assert "put the reference mesh there" in reopened.status().message
+        book.close()
 
 
 def test_a_withdrawn_pass_is_in_no_stage_and_stays_in_the_copy(scanned, tmp_path):

@@ -6,7 +6,7 @@ from typing import Any
 
 from sqlalchemy import Connection, text
 
-from scanner_service.storage.encoding import encode_line
+from scanner_service.storage.encoding import PLAIN, encode_line
 from tests.unit.storage.record_lines import line_of
 
 SESSION = "1m82614ch5ada4"
@@ -44,7 +44,7 @@ def make_schema_1(connection: Connection) -> str:
         key = {"device_id": line.device_id, "boot_id": line.boot_id, "line_index": number, "pass_index": 0}
         counts = {"line_number": number, "points": len(line.index), "points_before": points_before}
         row = {"session_id": SESSION, **key, **counts}
-        _insert(connection, "lines", row, encode_line(line))
+        _insert(connection, "lines", row, encode_line(line, PLAIN))
         points_before += len(line.index)
     event = {"number": 0, "time_utc": utc, "kind": "losses", "line_number": 3, "details": "{}"}
     _insert(connection, "events", {"session_id": SESSION, **event})

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from scanner_service.analysis.cloud import analyse_cloud
 from scanner_service.storage.exports import density_png
 from scanner_service.storage.exports.density_raster import rasterise, view_along
 from scanner_service.storage.exports.label_places import label_places
@@ -152,3 +153,18 @@ def test_few_labels_never_cover_each_other(anchors):
     for i, one in enumerate(places):
         for other in places[:i]:
             assert abs(one[0] - other[0]) >= 4.0 or abs(one[1] - other[1]) >= 3.0
+
+
+@pytest.mark.parametrize("scale", [1e-2, 1.0, 1e2])
+def test_a_plain_cloud_is_drawn_closed_whatever_its_size(scale):
+    """Points of unknown spacing reach as far as their neighbourhoods say: neither dust nor one blot."""
+    x, y = np.meshgrid(np.arange(20.0), np.arange(20.0))
+    cloud = np.column_stack([x.ravel(), y.ravel(), np.zeros(400)]) * scale
+    hole = (abs(cloud[:, 0] - 9.5 * scale) < 4 * scale) & (abs(cloud[:, 1] - 9.5 * scale) < 4 * scale)
+    snapshot = analyse_cloud(cloud[~hole], "flexible", uncertainty_mm=0.1 * scale).snapshot
+    raster = rasterise(snapshot, view_along(DOWN), 200)
+    assert 0.6 * scale < raster.reach_mm < 1.5 * scale
+    row, column = (int((9.5 * scale - low) / raster.pixel_mm) for low in (raster.bottom_mm, raster.left_mm))
+    assert not raster.seen[row, column]
+    row, column = (int((1.5 * scale - low) / raster.pixel_mm) for low in (raster.bottom_mm, raster.left_mm))
+    assert raster.seen[row, column]

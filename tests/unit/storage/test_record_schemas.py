@@ -10,7 +10,7 @@ from sqlalchemy import create_engine
 from scanner_service.storage.errors import CreationKeyReused, NotStorable
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
-from scanner_service.storage.rows import CreationKey
+from scanner_service.storage.rows import CreationKey, Stored
 from scanner_service.storage.tables import APPLICATION_ID, SCHEMA_VERSION
 from tests.unit.storage.record_lines import bits, line_of
 from tests.unit.storage.schema_1 import make_schema_1
@@ -44,11 +44,15 @@ def test_an_old_record_is_brought_up_to_date_and_keeps_all_it_held(tmp_path: Pat
     session = old_record(tmp_path / "r")
     for _ in range(2):
         with Record.open(tmp_path / "r") as record:
-            assert [bits(line) for _, line in record.lines(session)] == TRUTH
+            assert [bits(line) for _, line in record.lines(session)][:3] == TRUTH
             assert [event.kind for event in record.events(session)] == ["losses"]
             assert record.verify(session).problems == ()
             assert record.describe(session, notes="found again").notes == "found again"
             record.save_ledger(session, {"passes": []}).result()
+            again = [record.append(session, line_of(index)).result() for index in (1, 3)]
+            assert again[0] == Stored(1, "duplicate"), "whatever format it was stored in"
+            assert record.append(session, line_of(1, seed=1)).result() == Stored(1, "conflict")
+    assert again[1] == Stored(3, "duplicate")
     with closing(sqlite3.connect(tmp_path / "r")) as database:
         assert database.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
         assert database.execute("SELECT schema_version FROM record").fetchone() == (SCHEMA_VERSION,)

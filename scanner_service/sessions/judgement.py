@@ -1,0 +1,127 @@
+"""The verdict in force on a live session: renewed when it is asked to, regions followed through; decides no state.
+
+Any thread may ask for a verdict. The map is read through its engine, the copy of it and the regions are owned here.
+"""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+from scanner_service.rescan.followed import Change, RegionBook
+from scanner_service.rescan.region import RegionStatus
+from scanner_service.rescan.requirement import Requirement
+from scanner_service.sessions.engine import Engine
+from scanner_service.sessions.errors import SessionError
+from scanner_service.sessions.mirror import Mirror, difference_since
+from scanner_service.sessions.references import Nominal
+from scanner_service.sessions.results import Results, judge
+from scanner_service.sessions.sources import Source
+from scanner_service.sessions.updates import VerdictBook
+
+REGIONS_CHANGED = "regions_changed"
+REGIONS_FOLLOWED = "regions_followed"
+"""Events: what became of regions at one verdict; and, when a scan is over, what a later opening goes on with."""
+
+WriteEvent = Callable[[str, dict[str, Any]], None]
+
+
+class Judgement:
+    """Verdicts on one session, the latest of which is in force.
+
+    `verdicts` is the engine's book of them, into which each new one is put; `write_event` takes what became of regions.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        verdicts: VerdictBook,
+        requirement: Requirement,
+        nominal: Nominal,
+        write_event: WriteEvent,
+    ) -> None:
+        self._engine = engine
+        self._verdicts = verdicts
+        self._requirement = requirement
+        self._nominal = nominal
+        self._write_event = write_event
+        self._regions = RegionBook()
+        self._results: Results | None = None
+        self._in_force = threading.Lock()  # of the regions and the results
+        self._mirror = Mirror()
+        self._mirroring = threading.Lock()
+
+    def results(self) -> Results | None:
+        """The latest verdict; None before the first."""
+        return self._results
+
+    def go_on_from(self, followed: RegionBook) -> None:
+        """Follow the regions that an earlier opening left; before the first verdict only."""
+        self._regions = followed
+
+    def renew(self, source: Source, unless: int | None = None) -> Results | None:
+        """Judge the map as it is, seen from that source; None when the engine is gone.
+
+        The verdict in force is the answer while the map is still of version `unless`.
+        """
+        try:
+            if unless is not None and self._map_version() == unless:
+                return self._results
+            with self._mirroring:
+                since = self._mirror.version
+                change = self._engine.ask(lambda engine: difference_since(engine.live_map, since)).result()
+                snapshot = self._mirror.apply(change)
+            nominal = self._nominal
+            found = judge(
+                snapshot,
+                self._requirement,
+                source.geometry,
+                source.towards_sensor,
+                nominal.surface,
+                nominal.refused,
+            )
+            with self._in_force:
+                changes = self._regions.follow(snapshot, found.regions)
+                results = self._followed(found)
+            self._tell(changes)
+            self._engine.ask(
+                lambda engine: self._verdicts.replace(results.verdict, snapshot.version, engine.live_map)
+            ).result()
+        except SessionError:
+            return None
+        with self._in_force:
+            if self._results is None or snapshot.version >= self._results.snapshot.version:
+                results = self._results = self._followed(results)  # somebody may have marked a region meanwhile
+        return results
+
+    def mark_region(self, region_id: int, status: RegionStatus, why: str) -> None:
+        """Say of a region that it is unreachable, or that it is not after all; written down.
+
+        Raises
+        ------
+        SessionError : no such region is open.
+        """
+        with self._in_force:
+            try:
+                changes = self._regions.mark(region_id, status, why)
+            except KeyError:
+                raise SessionError(f"there is no open region {region_id} in this session") from None
+            if self._results is not None:
+                self._results = self._followed(self._results)
+        self._tell(changes)
+
+    def write_regions_down(self) -> None:
+        """Leave the regions as they are now to a later opening."""
+        with self._in_force:
+            self._write_event(REGIONS_FOLLOWED, self._regions.to_dict())
+
+    def _followed(self, results: Results) -> Results:
+        """The results, their regions with the ids, the status and the history that they have had."""
+        return replace(results, regions=self._regions.current, resolved=self._regions.resolved)
+
+    def _tell(self, changes: Sequence[Change]) -> None:
+        if changes:
+            self._write_event(REGIONS_CHANGED, {"changes": [change.to_dict() for change in changes]})
+
+    def _map_version(self) -> int:
+        return self._engine.ask(lambda engine: engine.live_map.read_version()).result()

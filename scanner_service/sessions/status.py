@@ -1,0 +1,29 @@
+"""What a session says of itself to people; knows nothing of how any of it came about."""
+
+from dataclasses import dataclass
+from typing import Any
+
+STATES = ("created", "scanning", "paused", "interrupted", "stopped", "failed")
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What a session is doing, for people: counts, rates, losses and, when something is amiss, one sentence.
+
+    `lines` and `points`: stored in the record, and counted in the map. `held`: a pause that lasts until somebody
+    resumes it.
+    """
+
+    session_id: str
+    name: str
+    state: str
+    created_utc: str
+    lines: int
+    points: int
+    points_per_s: float
+    coverage: float
+    progress: float | None
+    losses: dict[str, Any]
+    durable: dict[str, dict[str, int]]
+    message: str | None
+    held: bool
