@@ -1,14 +1,12 @@
 """Planes within each point's own optimal radius: small where the surface bends, large where noise rules."""
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.errors import MethodRefused
 from scanner_service.analysis.normals.choosing_count import Halves
 from scanner_service.analysis.normals.field import NormalField, NormalOptions, Tell, tell_nobody
-from scanner_service.analysis.normals.fitting import fit_all
-from scanner_service.analysis.normals.neighbourhoods import by_radius
+from scanner_service.analysis.normals.within import fit_within
 from scanner_service.analysis.optimal_radius import (
     C1,
     C2,
@@ -47,16 +45,15 @@ def adaptive_radius(points_mm: Float64Array, options: NormalOptions, tell: Tell 
         f"{found.radius_mm.max():.3g} mm, "
         f"at its floor on {found.at_floor.mean():.0%}, at its ceiling on {found.at_ceiling.mean():.0%} of the points",
     )
-    pieces = by_radius(cKDTree(points_mm), points_mm, found.radius_mm * _REACHES)
     extra = {"curvature_per_mm": found.curvature_per_mm, "density_per_mm2": found.density_per_mm2}
-    return fit_all(
+    return fit_within(
         NAME,
         points_mm,
-        pieces,
-        max_error_rad=options.max_error_rad,
+        found.radius_mm * _REACHES,
+        options,
+        lambda share: tell(0.9 + 0.1 * share),
         notes=notes,
         extra=extra,
-        tell=lambda share: tell(0.9 + 0.1 * share),
     )
 
 

@@ -121,7 +121,7 @@ def _axes_of_half(half_mm: Float64Array, at_mm: Float64Array, nearest: Int64Arra
     taken = nearest[np.arange(nearest.shape[1]) < counts[:, None]] + len(at_mm)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     given = Neighbourhoods(np.arange(len(at_mm)), starts, taken, np.zeros(len(at_mm)))
-    return plane_fits(everything, given, np.zeros(len(at_mm)))[0]
+    return plane_fits(everything, given)[0]
 
 
 def _mean_squared_sine(a: Float64Array, b: Float64Array) -> float:

@@ -99,13 +99,15 @@ def estimate_normals(
     count = int(finite.sum())
     if count < MIN_NEIGHBOURS:
         raise MethodRefused(f"normals need {MIN_NEIGHBOURS} points or more with finite coordinates, there are {count}")
-    kept = np.ascontiguousarray(points[finite])
+    kept = points[finite]
     middle = kept.mean(axis=0)
-    if not np.isfinite(middle).all() or float(np.abs(kept - middle).max()) > MAX_EXTENT_MM:
+    with np.errstate(over="ignore", invalid="ignore"):
+        kept -= middle
+    if not np.isfinite(middle).all() or max(float(kept.max()), -float(kept.min())) > MAX_EXTENT_MM:
         raise MethodRefused(
             f"the points reach farther than {MAX_EXTENT_MM:g} mm from their middle: check the units, remove outliers"
         )
-    field = chosen.estimate(kept - middle, options, tell)
+    field = chosen.estimate(kept, options, tell)
     return field if finite.all() else _spread(field, finite)
 
 

@@ -57,6 +57,7 @@ class NormalOptions:
     floor_mm, ceiling_mm : bounds of a radius that adapts.
     ball_factor : a Delaunay ball is big when its radius is larger than so many times the nearest-neighbour scale.
     max_error_rad : a normal whose predicted error is larger is not given; infinity gives all that are determined.
+    threads : how many work at once, where a method can share its work out; they change no result.
 
     Raises
     ------
@@ -70,6 +71,7 @@ class NormalOptions:
     ceiling_mm: float | None = None
     ball_factor: float | None = None
     max_error_rad: float = math.radians(5.0)
+    threads: int = 1
 
     def __post_init__(self) -> None:
         for name in ("radius_mm", "floor_mm", "ceiling_mm", "ball_factor"):
@@ -86,12 +88,13 @@ class NormalOptions:
             raise ValueError(f"the floor of {self.floor_mm:g} mm lies above the ceiling of {self.ceiling_mm:g} mm")
         if not self.max_error_rad > 0:
             raise ValueError(f"max_error_rad must be greater than 0, not {self.max_error_rad}")
+        if self.threads < 1:
+            raise ValueError(f"at least 1 thread is needed, not {self.threads}")
 
     def given(self) -> set[str]:
-        """Names of the options that are stated, the error limit aside, which all methods read."""
-        return {
-            item.name for item in fields(self) if item.name != "max_error_rad" and getattr(self, item.name) is not None
-        }
+        """Names of the options that are stated, error limit and threads aside, which all methods may be told."""
+        told = {"max_error_rad", "threads"}
+        return {item.name for item in fields(self) if item.name not in told and getattr(self, item.name) is not None}
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,7 @@
 """Planes through neighbourhoods, plain or weighted by distance; knows not how the neighbourhoods were chosen."""
 
 from collections.abc import Iterable, Mapping
+from enum import IntEnum
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,19 @@ from scanner_service.analysis.normals.field import (
 from scanner_service.analysis.normals.neighbourhoods import Neighbourhoods
 from scanner_service.analysis.plane import smallest_axis
 
+class Weighting(IntEnum):
+    """How a point at distance d within a neighbourhood of radius r weighs."""
+
+    EQUAL = 0
+    GAUSSIAN = 1
+    """exp(-d²/h²), h being WIDTH_SHARE of r (Pauly et al. 2003)."""
+    BIWEIGHT = 2
+    """(1 - d²/r²)²: smooth down to the rim, where a Gaussian is cut off (Fan and Gijbels 1996)."""
+
+
+WIDTH_SHARE = 1.0 / 3.0
+"""h of the Gaussian weight, as a share of the neighbourhood's radius."""
+
 MIN_SPREAD = 1e-9
 """The second moment must be at least this share of the first; below, the points lie on a line."""
 
@@ -28,15 +42,14 @@ def fit_all(
     neighbourhoods: Iterable[Neighbourhoods],
     *,
     max_error_rad: float,
-    width_share: float = 0.0,
+    weighting: Weighting = Weighting.EQUAL,
     notes: tuple[str, ...] = (),
     extra: Mapping[str, Float64Array] | None = None,
     tell: Tell = tell_nobody,
 ) -> NormalField:
     """Planes of least squared orthogonal distance through every neighbourhood (Ahn 2004, Eqs. 6.5 to 6.10).
 
-    With `width_share` > 0 a point at distance d weighs exp(-d²/h²), h being that share of the neighbourhood's radius
-    (Pauly et al. 2003). Together the neighbourhoods have each of the points (n, 3) once.
+    Points weigh as `weighting` says. Together the neighbourhoods have each of the points (n, 3) once.
 
     The predicted error is the asymptotic one of a principal axis, √(λ2 λ3) / ((λ2 - λ3) √(N - 3)) (Anderson 1963),
     N being the effective number of points, (Σw)² / Σw²; it tends to σ/√λ2 on a flat patch.
@@ -48,7 +61,7 @@ def fit_all(
     radius = np.full(n, np.nan)
     counts = np.zeros(n, dtype=np.int64)
     for some in neighbourhoods:
-        axes, moments, effective = plane_fits(points_mm, some, width_share * some.radius_mm)
+        axes, moments, effective = plane_fits(points_mm, some, weighting)
         count = np.diff(some.starts)
         normals[some.at], reason[some.at], error[some.at] = judge_planes(axes, moments, effective, count, max_error_rad)
         radius[some.at], counts[some.at] = some.radius_mm, count
@@ -74,18 +87,32 @@ def judge_planes(
 
 
 def plane_fits(
-    points_mm: Float64Array, some: Neighbourhoods, width_mm: Float64Array
+    points_mm: Float64Array, some: Neighbourhoods, weighting: Weighting = Weighting.EQUAL
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Axis of the smallest moment (m, 3), moments in mm² (m, 3), largest first, and effective counts (m,).
-
-    `width_mm` (m,) is h of the Gaussian weight; 0 weighs all alike.
-    """
+    """Axis of the smallest moment (m, 3), moments in mm² (m, 3), largest first, and effective counts (m,)."""
     m = len(some.at)
     axes, moments, effective = np.empty((m, 3)), np.empty((m, 3)), np.empty(m)
-    with np.errstate(divide="ignore"):
-        per_square = np.where(width_mm > 0.0, 1.0 / (width_mm * width_mm), 0.0)
-    _fit(points_mm, some.at, some.starts, some.rows, per_square, axes, moments, effective)
+    per_square = per_square_of(some.radius_mm, weighting)
+    _fit(points_mm, some.at, some.starts, some.rows, int(weighting), per_square, axes, moments, effective)
     return axes, moments, effective
+
+
+def per_square_of(radius_mm: Float64Array, weighting: Weighting) -> Float64Array:
+    """What `weight_of` multiplies squared distances with, 1/mm² (m,); 0 for a neighbourhood of one place."""
+    width_mm = WIDTH_SHARE * radius_mm if weighting == Weighting.GAUSSIAN else radius_mm
+    with np.errstate(divide="ignore"):
+        return np.where(width_mm > 0.0, 1.0 / (width_mm * width_mm), 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def weight_of(weighting: int, square: float, per_square: float) -> float:
+    """The weight of a point at that squared distance."""
+    if weighting == 0:
+        return 1.0
+    share = square * per_square
+    if weighting == 1:
+        return float(np.exp(-share))
+    return (1.0 - share) * (1.0 - share) if share < 1.0 else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -94,6 +121,7 @@ def _fit(
     at: Int64Array,
     starts: Int64Array,
     rows: Int64Array,
+    weighting: int,
     per_square: Float64Array,
     axes: Float64Array,
     moments: Float64Array,
@@ -105,7 +133,7 @@ def _fit(
         w = w2 = x = y = z = xx = xy = xz = yy = yz = zz = 0.0
         for k in range(starts[i], starts[i + 1]):
             dx, dy, dz = points[rows[k], 0] - px, points[rows[k], 1] - py, points[rows[k], 2] - pz
-            g = np.exp(-(dx * dx + dy * dy + dz * dz) * per_square[i]) if per_square[i] > 0.0 else 1.0
+            g = weight_of(weighting, dx * dx + dy * dy + dz * dz, per_square[i])
             w += g
             w2 += g * g
             x, y, z = x + g * dx, y + g * dy, z + g * dz

@@ -6,8 +6,7 @@ from scipy.spatial import cKDTree
 from drivers.scanline import Float64Array
 from scanner_service.analysis.normals.choosing_count import choose_count, radius_of_count
 from scanner_service.analysis.normals.field import NormalField, NormalOptions, Tell, tell_nobody
-from scanner_service.analysis.normals.fitting import fit_all
-from scanner_service.analysis.normals.neighbourhoods import by_radius
+from scanner_service.analysis.normals.within import fit_within
 
 NAME = "fixed_radius"
 
@@ -17,12 +16,10 @@ def fixed_radius(points_mm: Float64Array, options: NormalOptions, tell: Tell = t
 
     Without a stated radius it is the median distance to the k-th neighbour, k being chosen for the cloud.
     """
-    tree = cKDTree(points_mm)
     notes: tuple[str, ...] = ()
     radius_mm = options.radius_mm
     if radius_mm is None:
         count = choose_count(points_mm)
-        radius_mm = radius_of_count(tree, points_mm, count)
+        radius_mm = radius_of_count(cKDTree(points_mm), points_mm, count)
         notes = (f"radius {radius_mm:.4g} mm, chosen: half of the points have {count} neighbours within it",)
-    pieces = by_radius(tree, points_mm, np.full(len(points_mm), radius_mm))
-    return fit_all(NAME, points_mm, pieces, max_error_rad=options.max_error_rad, tell=tell, notes=notes)
+    return fit_within(NAME, points_mm, np.full(len(points_mm), radius_mm), options, tell, notes=notes)

@@ -12,7 +12,8 @@ from scanner_service.analysis.normals.field import Int64Array
 
 PAIRS_AT_ONCE = 2_000_000
 MAX_MEAN_NEIGHBOURS = 5_000
-_PROBE = 200
+PROBE = 200
+"""So many points say how crowded a radius is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,13 +37,9 @@ def by_radius(tree: cKDTree, points_mm: Float64Array, radius_mm: Float64Array) -
     MethodRefused : the radius reaches so many points that the work would not end.
     """
     n = len(points_mm)
-    probe = np.unique(np.linspace(0, n - 1, _PROBE).astype(np.int64))
+    probe = np.unique(np.linspace(0, n - 1, PROBE).astype(np.int64))
     mean = float(np.mean(tree.query_ball_point(points_mm[probe], radius_mm[probe], return_length=True)))
-    if mean > MAX_MEAN_NEIGHBOURS:
-        raise MethodRefused(
-            f"a radius of {np.median(radius_mm):.4g} mm holds {mean:,.0f} points on average, at most "
-            f"{MAX_MEAN_NEIGHBOURS:,} are taken: choose a smaller one, or check the units"
-        )
+    refuse_crowds(mean, radius_mm)
     counts = np.asarray(tree.query_ball_point(points_mm, radius_mm, return_length=True), dtype=np.int64)
     ends = np.cumsum(counts)
     first = 0
@@ -56,6 +53,15 @@ def by_radius(tree: cKDTree, points_mm: Float64Array, radius_mm: Float64Array) -
             rows[starts[i] : starts[i + 1]] = some
         yield Neighbourhoods(np.arange(first, last), starts, rows, radius_mm[first:last])
         first = last
+
+
+def refuse_crowds(mean: float, radius_mm: Float64Array) -> None:
+    """Raise MethodRefused when radii (n,) hold more than MAX_MEAN_NEIGHBOURS points on average."""
+    if mean > MAX_MEAN_NEIGHBOURS:
+        raise MethodRefused(
+            f"a radius of {np.median(radius_mm):.4g} mm holds {mean:,.0f} points on average, at most "
+            f"{MAX_MEAN_NEIGHBOURS:,} are taken: choose a smaller one, or check the units"
+        )
 
 
 def by_number(tree: cKDTree, points_mm: Float64Array, at: Int64Array, count: int) -> Iterator[Neighbourhoods]:

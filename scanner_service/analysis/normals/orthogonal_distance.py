@@ -7,7 +7,8 @@ from drivers.scanline import Float64Array
 from scanner_service.analysis.normals.choosing_count import choose_count
 from scanner_service.analysis.normals.field import NormalField, NormalOptions, Tell, tell_nobody
 from scanner_service.analysis.normals.fitting import fit_all
-from scanner_service.analysis.normals.neighbourhoods import by_number, by_radius
+from scanner_service.analysis.normals.neighbourhoods import by_number
+from scanner_service.analysis.normals.within import fit_within
 
 NAME = "orthogonal_distance"
 
@@ -17,14 +18,12 @@ def orthogonal_distance(points_mm: Float64Array, options: NormalOptions, tell: T
 
     The neighbourhood is a stated radius or number of points; with neither the number is chosen for the cloud.
     """
-    tree = cKDTree(points_mm)
     if options.radius_mm is not None:
-        pieces = by_radius(tree, points_mm, np.full(len(points_mm), options.radius_mm))
-        return fit_all(NAME, points_mm, pieces, max_error_rad=options.max_error_rad, tell=tell)
+        return fit_within(NAME, points_mm, np.full(len(points_mm), options.radius_mm), options, tell)
     notes: tuple[str, ...] = ()
     count = options.neighbours
     if count is None:
         count = choose_count(points_mm)
         notes = (f"{count} neighbours, chosen: two halves of the cloud agree best on normals with so many",)
-    pieces = by_number(tree, points_mm, np.arange(len(points_mm)), count)
+    pieces = by_number(cKDTree(points_mm), points_mm, np.arange(len(points_mm)), count)
     return fit_all(NAME, points_mm, pieces, max_error_rad=options.max_error_rad, tell=tell, notes=notes)
