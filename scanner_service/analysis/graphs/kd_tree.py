@@ -78,6 +78,19 @@ def distance_sq(xyz: Float64Array, i: int, j: int) -> float:
     return dx * dx + dy * dy + dz * dz
 
 
+def squares_to(xyz: Float64Array, to: Int32Array) -> Float64Array:
+    """Squared distance (n,) of each point (n, 3) to the one at the position `to` (n,)."""
+    square = np.empty(len(xyz))
+    _square(xyz, to, square)
+    return square
+
+
+@njit(cache=True, nogil=True)
+def _square(xyz: Float64Array, to: Int32Array, square: Float64Array) -> None:
+    for i in range(len(xyz)):
+        square[i] = distance_sq(xyz, i, to[i])
+
+
 @njit(cache=True, nogil=True)
 def _build(xyz: Float64Array, row: Int32Array, levels: int, box: Float64Array) -> None:
     n = len(xyz)

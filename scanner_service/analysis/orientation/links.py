@@ -18,6 +18,7 @@ from numba import njit
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.graphs.kd_tree import Int32Array, distance_sq
+from scanner_service.analysis.graphs.slices import in_slices
 from scanner_service.analysis.graphs.spanning import Float32Array
 
 Int8Array = npt.NDArray[np.int8]
@@ -43,7 +44,13 @@ _SURFACE, _CREASE, _DOUBTFUL, _GAP = (np.uint8(kind) for kind in LinkKind)
 
 
 def judge_links(
-    xyz: Float64Array, normals: Float32Array, links: Int32Array, reach_sq: Float64Array, gap_factor: float, plain: bool
+    xyz: Float64Array,
+    normals: Float32Array,
+    links: Int32Array,
+    reach_sq: Float64Array,
+    gap_factor: float,
+    plain: bool,
+    threads: int = 1,
 ) -> tuple[Float32Array, npt.NDArray[np.uint8], Int8Array]:
     """Weight, kind and sign of every link (m, 2) between points (n, 3) with unit normals (n, 3).
 
@@ -55,7 +62,13 @@ def judge_links(
     weight = np.empty(len(links), dtype=np.float32)
     kind = np.empty(len(links), dtype=np.uint8)
     sign = np.empty(len(links), dtype=np.int8)
-    _judge(xyz, normals, links, reach_sq, gap_factor * gap_factor, plain, weight, kind, sign)
+    gap_sq = gap_factor * gap_factor
+
+    def judge(start: int, stop: int) -> None:
+        some = slice(start, stop)
+        _judge(xyz, normals, links[some], reach_sq, gap_sq, plain, weight[some], kind[some], sign[some])
+
+    in_slices(judge, len(links), threads)
     return weight, kind, sign
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.scanline import BoolArray, Float64Array
-from scanner_service.analysis.graphs.kd_tree import Int32Array
+from scanner_service.analysis.graphs.kd_tree import Int32Array, squares_to
 from scanner_service.analysis.graphs.places import LARGEST, Places, find_places
 from scanner_service.analysis.graphs.riemannian import NEIGHBOURS, check_neighbours, riemannian_links
 from scanner_service.analysis.graphs.shortest_links import shortest_links
@@ -14,6 +14,7 @@ from scanner_service.analysis.graphs.spanning import Float32Array, minimum_spann
 from scanner_service.analysis.orientation.evidence import Evidence, enclosed, weigh_components
 from scanner_service.analysis.orientation.links import CLEAR, Int8Array, LinkKind, judge_links
 from scanner_service.analysis.orientation.result import ComponentTable, Doubt, Orientation
+from scanner_service.analysis.orientation.rows import Int64Array, contradictions, first_places, turn_rows, unit_rows
 from scanner_service.analysis.orientation.spreading import patches, spread
 
 GAP_FACTOR = 5.0
@@ -27,6 +28,9 @@ OPEN = 0.1
 
 FULL = 0.1
 """Below this fullness the enclosed volume does not tell inside from outside."""
+
+CONFIRMING = 2
+"""A point is sure only where so many links along the surface confirm its side: a single one may be a leap."""
 
 CONTRADICTING = 0.01
 """Above this share of contradicting links nothing is sure."""
@@ -75,31 +79,36 @@ def orient_normals(
     points, given, rows, left_out = _take_part(points_mm, normals)
     places = find_places(points if len(rows) == len(points) else points[rows])
     xyz, row = places.tree.xyz, rows[places.tree.row]
-    unit = _unit(given[row])
+    unit = unit_rows(given, row)
     web = _weave(places, unit, neighbours, np.inf if plain else gap_factor, plain, threads)
     component, starts, sure = _components(web, xyz[:, 2], row, plain)
     side = np.ones(len(row), dtype=np.int8)
     side[starts] = np.where(unit[starts, 2] < 0.0, -1, 1)
-    spread(starts, web.links[web.is_tree], web.sign[web.is_tree], side)
+    spread(starts, web.links, web.sign, web.is_tree, side)
+    links, disagreeing, confirming = contradictions(
+        web.links, web.kind, web.sign, side, component, len(starts), sure
+    )
+    sure &= confirming >= CONFIRMING
+    area = web.area
+    del web
     unit *= side[:, None]
-    evidence = weigh_components(xyz, unit, web.area, component, len(starts))
-    agreement = _compare(web, side, component, len(starts), sure)
+    evidence = weigh_components(xyz, unit, area, component, len(starts))
     sure_points = np.bincount(component, sure, len(starts)).astype(np.int64)
-    doubt = _doubt(evidence, agreement, sure_points)
+    doubt = _doubt(evidence, links, disagreeing, sure_points)
     turned = (doubt & _NO_VOLUME == 0) & (evidence.fullness < 0.0) & (not plain)
     side = np.where(turned[component], -side, side).astype(np.int8)
-    doubt[enclosed(xyz, unit, web.area, component, doubt & _SIDE_UNKNOWN == 0)] |= np.uint8(Doubt.ENCLOSED)
+    doubt[enclosed(xyz, unit, area, component, doubt & _SIDE_UNKNOWN == 0)] |= np.uint8(Doubt.ENCLOSED)
     outside_known = doubt & _SIDE_UNKNOWN == 0
     components = ComponentTable(
         points=evidence.points,
         sure_points=sure_points,
-        start_row=row[starts],
+        start_row=row[starts].astype(np.int64),
         confidence=0.5 + 0.5 * outside_known * sure_points / evidence.points,
         openness=evidence.openness,
         fullness=np.where(turned, -evidence.fullness, evidence.fullness),
         turned=turned,
-        links=agreement.links,
-        disagreeing=agreement.disagreeing,
+        links=links,
+        disagreeing=disagreeing,
         doubt=doubt,
     )
     sure &= outside_known[component]
@@ -108,29 +117,22 @@ def orient_normals(
 
 def _take_part(
     points_mm: npt.ArrayLike, normals: npt.ArrayLike
-) -> tuple[Float64Array, Float64Array, npt.NDArray[np.int64], dict[str, int]]:
+) -> tuple[Float64Array, Float64Array, Int32Array, dict[str, int]]:
     """Points and normals as arrays, the rows that have both, and how many have not, by reason."""
     points, given = np.asarray(points_mm, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or given.shape != points.shape:
         raise ValueError(f"points and normals must both have the shape (n, 3), not {points.shape} and {given.shape}")
     with np.errstate(invalid="ignore"):
-        is_place = (np.abs(points) <= LARGEST).all(axis=1)
-        is_normal = np.isfinite(given).all(axis=1) & given.any(axis=1)
+        is_place = (points <= LARGEST).all(axis=1) & (points >= -LARGEST).all(axis=1)
+    is_normal = np.isfinite(given).all(axis=1) & given.any(axis=1)
     left_out = {"not_finite": int((~is_place).sum()), "no_normal": int((is_place & ~is_normal).sum())}
-    rows = np.flatnonzero(is_place & is_normal)
+    rows = np.flatnonzero(is_place & is_normal).astype(np.int32)
     if not len(rows):
         raise ValueError(
             f"none of {len(points)} points has both a place and a normal, so there is nothing to orient: "
             "estimate normals first, perhaps with a larger radius"
         )
     return points, given, rows, left_out
-
-
-def _unit(normals: Float64Array) -> Float32Array:
-    """Normals at length 1; float32 is enough to tell a side."""
-    scaled = normals / np.abs(normals).max(axis=1, keepdims=True)
-    scaled /= np.sqrt((scaled * scaled).sum(axis=1, keepdims=True))
-    return scaled.astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,79 +156,56 @@ def _weave(places: Places, unit: Float32Array, neighbours: int, gap_factor: floa
     xyz = places.tree.xyz
     near = places.nearest(neighbours, threads)
     if near.shape[1]:
-        offset = xyz - xyz[near[:, -1]]
-        reach_sq = (offset * offset).sum(axis=1)
+        reach_sq = squares_to(xyz, near[:, -1])
         links = riemannian_links(shortest_links(places.tree, near), near)
     else:
         reach_sq = np.ones(len(xyz))
         links = np.empty((0, 2), dtype=np.int32)
     del near
-    weight, kind, sign = judge_links(xyz, unit, links, reach_sq, gap_factor, plain)
+    weight, kind, sign = judge_links(xyz, unit, links, reach_sq, gap_factor, plain, threads)
     joins = kind != LinkKind.GAP
     if not joins.all():
         links, weight, kind, sign = links[joins], weight[joins], kind[joins], sign[joins]
+    del joins
     is_tree, group = minimum_spanning_forest(len(xyz), links[:, 0], links[:, 1], weight)
-    return _Web(links, kind, sign, is_tree, group, np.pi * reach_sq / neighbours)
+    return _Web(links, kind, sign, is_tree, group, (np.pi / neighbours) * reach_sq)
 
 
 def _components(
-    web: _Web, z_mm: Float64Array, row: npt.NDArray[np.int64], plain: bool
-) -> tuple[Int32Array, npt.NDArray[np.int64], BoolArray]:
+    web: _Web, z_mm: Float64Array, row: Int32Array, plain: bool
+) -> tuple[Int32Array, Int32Array, BoolArray]:
     """The component (n,) of each place, by falling number of places, the start (C,) of each, and who is sure (n,).
 
     Sure is the largest patch of a component that no doubtful link holds together. The start is the point of the
     largest z in it; in the plain method, in the component.
     """
-    certain = web.is_tree & (web.kind <= LinkKind.CREASE)
-    patch = patches(len(row), web.links[certain])
-    held = np.bincount(patch, minlength=len(row))
-    # within each component the largest patch first, in it the highest point, of equal ones the earliest row
-    order = np.lexsort((row, -z_mm, patch, -held[patch], web.group))
-    is_first = np.diff(web.group[order], prepend=-1) != 0
-    size = np.bincount(web.group, minlength=len(row))
-    first = order[is_first]
-    by_size = np.lexsort((row[first], -size[web.group[first]]))
-    rank = np.empty(len(row), dtype=np.int32)
-    rank[web.group[first[by_size]]] = np.arange(len(first))
-    component = rank[web.group]
-    sure: BoolArray = patch == patch[first[by_size]][component]
-    if plain:
-        order = np.lexsort((row, -z_mm, component))
-        return component, order[np.diff(component[order], prepend=-1) != 0], sure
-    return component, first[by_size], sure
+    n = len(row)
+    patch = patches(n, web.links, web.is_tree & (web.kind <= LinkKind.CREASE))
+    largest, start = first_places(web.group, patch, z_mm, row)
+    trees = np.flatnonzero(start >= 0)
+    first = first_places(web.group, web.group, z_mm, row)[1][trees] if plain else start[trees]
+    size = np.bincount(web.group, minlength=n)[trees]
+    by_size = np.lexsort((row[first], -size))
+    rank = np.full(n, -1, dtype=np.int32)
+    rank[trees[by_size]] = np.arange(len(trees))
+    sure: BoolArray = patch == largest[web.group]
+    return rank[web.group], first[by_size], sure
 
 
-@dataclass(frozen=True, slots=True)
-class _Agreement:
-    """Per component (C,): links along the surface, and those whose ends ended up on different sides."""
-
-    links: npt.NDArray[np.int64]
-    disagreeing: npt.NDArray[np.int64]
-
-
-def _compare(web: _Web, side: Int8Array, component: Int32Array, count: int, sure: BoolArray) -> _Agreement:
-    """Compare the sides found with what each link along the surface says; the ends of one that differs are not sure."""
-    tells = web.kind <= LinkKind.CREASE
-    one, other = web.links[tells, 0], web.links[tells, 1]
-    differs = side[one] * side[other] != web.sign[tells]
-    sure[one[differs]] = False
-    sure[other[differs]] = False
-    of = component[one]
-    return _Agreement(np.bincount(of, minlength=count), np.bincount(of[differs], minlength=count))
-
-
-def _doubt(evidence: Evidence, agreement: _Agreement, sure_points: npt.NDArray[np.int64]) -> npt.NDArray[np.uint8]:
+def _doubt(
+    evidence: Evidence, links: Int64Array, disagreeing: Int64Array, sure_points: Int64Array
+) -> npt.NDArray[np.uint8]:
     """Why each component, or a part of it, is a guess."""
     small = evidence.points < LEAST_POINTS
     is_open = ~small & (evidence.openness > OPEN)
     flat = ~small & ~is_open & (np.abs(evidence.fullness) < FULL)
-    contradicts = agreement.disagreeing > CONTRADICTING * agreement.links
+    contradicts = disagreeing > CONTRADICTING * links
     doubt = np.zeros(len(small), dtype=np.uint8)
     for why, where in (
         (Doubt.SMALL, small),
         (Doubt.OPEN, is_open),
         (Doubt.FLAT, flat),
-        (Doubt.LINKS, sure_points < evidence.points),
+        (Doubt.LINKS, ~small & (sure_points < evidence.points)),
         (Doubt.CONTRADICTION, contradicts),
     ):
         doubt[where] |= np.uint8(why)
@@ -236,7 +215,7 @@ def _doubt(evidence: Evidence, agreement: _Agreement, sure_points: npt.NDArray[n
 def _to_rows(
     given: Float64Array,
     places: Places,
-    rows: npt.NDArray[np.int64],
+    rows: Int32Array,
     side: Int8Array,
     component: Int32Array,
     sure: BoolArray,
@@ -245,17 +224,14 @@ def _to_rows(
 ) -> Orientation:
     """From places in tree order to the rows of the cloud; a twin is turned like the point that stands for it."""
     row = rows[places.tree.row]
-    sign = np.zeros(len(given))
+    sign = np.zeros(len(given), dtype=np.int8)
     of = np.full(len(given), -1, dtype=np.int32)
     is_sure = np.zeros(len(given), dtype=np.bool_)
     sign[row], of[row], is_sure[row] = side, component, sure
     twin, first = rows[places.twin], rows[places.twin_of]
     if len(twin):
-        along = (_unit(given[twin]) * _unit(given[first])).sum(axis=1)
-        sign[twin] = np.where(along < 0.0, -1.0, 1.0) * sign[first]
+        along = (unit_rows(given, twin) * unit_rows(given, first)).sum(axis=1)
+        sign[twin] = np.where(along < 0.0, -1, 1) * sign[first]
         of[twin] = of[first]
         is_sure[twin] = is_sure[first] & (np.abs(along) >= CLEAR)
-    normals = np.full(given.shape, np.nan)
-    normals[rows] = given[rows] / np.abs(given[rows]).max(axis=1, keepdims=True)
-    normals[rows] *= (sign[rows] / np.sqrt((normals[rows] ** 2).sum(axis=1)))[:, None]
-    return Orientation(normals, of, is_sure, components, left_out)
+    return Orientation(turn_rows(given, sign), of, is_sure, components, left_out)
