@@ -11,7 +11,7 @@ from numba import njit
 from scipy.spatial import cKDTree
 
 from drivers.scanline import BoolArray, Float64Array, read_only
-from scanner_service.analysis.normals.choosing_count import SAMPLE, choose_count
+from scanner_service.analysis.normals.choosing_count import choose_count
 from scanner_service.analysis.normals.field import MAX_NEIGHBOURS, Int64Array, Tell, tell_nobody
 from scanner_service.analysis.normals.neighbourhoods import by_number
 from scanner_service.analysis.quadrics.bivariate import curvatures_at, fit_bivariate, frame_at
@@ -34,6 +34,7 @@ ROUNDS = 60
 ENOUGH = 100
 """While a radius is sought, a curvature is fitted to about so many of its neighbours at most."""
 
+NOISE_SAMPLE = 2000
 _NOISE_NEIGHBOURS = (30, 100)
 
 
@@ -112,7 +113,7 @@ def estimate_noise_mm(points_mm: Float64Array) -> float:
     if n < least:
         return math.nan
     count = min(max(choose_count(points_mm), least), most)
-    sample = np.argsort(mixed(np.arange(n, dtype=np.uint64)), kind="stable")[:SAMPLE]
+    sample = np.argsort(mixed(np.arange(n, dtype=np.uint64)), kind="stable")[:NOISE_SAMPLE]
     residual = []
     for some in by_number(cKDTree(points_mm), points_mm, sample, count):
         found = np.full(len(some.at), np.nan)

@@ -1,11 +1,15 @@
-"""Planes within each point's own optimal radius: small where the surface bends, large where noise rules."""
+"""Planes within each point's own radius: small where the surface bends, large where noise rules."""
+
+import math
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.errors import MethodRefused
-from scanner_service.analysis.normals.choosing_count import Halves
-from scanner_service.analysis.normals.field import NormalField, NormalOptions, Tell, tell_nobody
+from scanner_service.analysis.normals.choosing_count import Deals, Reference
+from scanner_service.analysis.normals.field import Int64Array, NormalField, NormalOptions, Tell, tell_nobody
+from scanner_service.analysis.normals.fitting import Weighting
 from scanner_service.analysis.normals.within import fit_within
 from scanner_service.analysis.optimal_radius import (
     C1,
@@ -17,63 +21,119 @@ from scanner_service.analysis.optimal_radius import (
 )
 
 NAME = "adaptive_radius"
-SCALES = (1.0, 0.1, 8.0, 64.0, 512.0, 4096.0)
-"""What the constants of the formula are multiplied by, tried in this order; the first of equals is taken."""
-SCALE_SAMPLE = 500
+SCALES = (1.0, 8.0, 64.0, 512.0)
+"""What the constants of the formula are multiplied by, so that it speaks of the radius that the cloud needs."""
 
-_REACHES = 1.0 + 1e-12
+EXPONENTS = (0.5, 1.0, 0.0)
+"""How far the formula is followed from point to point, tried in this order; the first of equals is taken."""
+
+SCALE_SAMPLE = 500
+LEAST = 10
+"""No neighbourhood has fewer points, the point itself counted."""
+
+_REACHES = 1.0 + 1e-9
 
 
 def adaptive_radius(points_mm: Float64Array, options: NormalOptions, tell: Tell = tell_nobody) -> NormalField:
-    """Normals of (n, 3) by plane fits within the optimal radius of Mitra, Nguyen and Guibas (2004).
+    """Normals of (n, 3) by weighted plane fits, radius by radius after Mitra, Nguyen and Guibas (2004).
+
+    The formula tells how radii should differ from point to point, its constants bound the worst case. So the radius is
+    R (m / M)^a: m the formula's radius at the point, M its median, R the distance to the k-th nearest point. The two
+    halves of the cloud tell k and a (`Deals`).
 
     Raises
     ------
     MethodRefused : fewer points than the first round of the iteration needs.
     """
-    if len(points_mm) < FIRST_NEIGHBOURS:
+    n = len(points_mm)
+    if n < FIRST_NEIGHBOURS:
         raise MethodRefused(
-            f"an adaptive radius needs {FIRST_NEIGHBOURS} points or more, there are {len(points_mm)}: use fixed_radius"
+            f"an adaptive radius needs {FIRST_NEIGHBOURS} points or more, there are {n}: use fixed_radius"
         )
-    scale = choose_scale(points_mm, options)
-    law = _law(options, scale)
-    found = optimal_radius(points_mm, options.noise_mm, law, lambda share: tell(0.9 * share))
+    noise_mm = estimate_noise_mm(points_mm) if options.noise_mm is None else options.noise_mm
+    tree = cKDTree(points_mm)
+    deals = Deals.deal(points_mm, Weighting.BIWEIGHT)
+    scale, exponent, count = 1.0, 1.0, 0
+    if len(deals.ladder) > 1:
+        reference = deals.reference()
+        count = deals.best(reference)
+        scale = _scale(points_mm, noise_mm, options, deals, float(np.median(_reach(tree, deals.at_mm, count))))
+        exponent, count = _blend(points_mm, noise_mm, options, deals, reference, tree, scale)
+    found = optimal_radius(points_mm, noise_mm, _law(options, scale), lambda share: tell(0.9 * share))
+    radius_mm = found.radius_mm * _REACHES
+    if count:
+        radius_mm = _reach(tree, points_mm, count) * _relative(found.radius_mm) ** exponent
+        radius_mm = np.maximum(radius_mm, _reach(tree, points_mm, min(LEAST, n))) * _REACHES
+        radius_mm = np.clip(radius_mm, options.floor_mm, math.inf if options.ceiling_mm is None else options.ceiling_mm)
     known = "given" if options.noise_mm is not None else "estimated"
     notes = (
-        f"constants c1 and c2 are {scale:g} times the customary ones, chosen: two halves of the cloud agree best so",
-        f"noise {found.noise_mm:.3g} mm, {known}; radius from {found.radius_mm.min():.3g} to "
-        f"{found.radius_mm.max():.3g} mm, "
-        f"at its floor on {found.at_floor.mean():.0%}, at its ceiling on {found.at_ceiling.mean():.0%} of the points",
+        f"constants c1 and c2 are {scale:g} times the customary ones, radii follow the formula to the power "
+        f"{exponent:g} around {count or FIRST_NEIGHBOURS} neighbours: two halves of the cloud agree best so",
+        f"noise {found.noise_mm:.3g} mm, {known}; radius from {radius_mm.min():.3g} to {radius_mm.max():.3g} mm, the "
+        f"formula at its floor on {found.at_floor.mean():.0%}, at its ceiling on {found.at_ceiling.mean():.0%} of the "
+        "points",
     )
-    extra = {"curvature_per_mm": found.curvature_per_mm, "density_per_mm2": found.density_per_mm2}
     return fit_within(
         NAME,
         points_mm,
-        found.radius_mm * _REACHES,
+        radius_mm,
         options,
         lambda share: tell(0.9 + 0.1 * share),
+        weighting=Weighting.BIWEIGHT,
         notes=notes,
-        extra=extra,
+        extra={"curvature_per_mm": found.curvature_per_mm, "density_per_mm2": found.density_per_mm2},
     )
 
 
-def choose_scale(points_mm: Float64Array, options: NormalOptions) -> float:
-    """How many times the customary c1 and c2 serve the points (n, 3) best, one of SCALES.
+def _scale(
+    points_mm: Float64Array, noise_mm: float, options: NormalOptions, deals: Deals, reach_mm: float
+) -> float:
+    """The scale, one of SCALES, for which the formula's median radius comes nearest to the one the cloud needs.
 
     The formula bounds the worst case, in which all the curvature of a neighbourhood lies on one side of the point. On
-    smooth surfaces that costs a large part of what a larger radius would average away. The two halves of the cloud
-    tell (`choose_count`).
+    smooth surfaces its radius is far too small, and a curvature that is measured within it is noise.
     """
-    halves = Halves.deal(points_mm, SCALE_SAMPLE)
-    if len(halves.ladder) < 2:
-        return 1.0
-    reference = halves.reference()
-    noise_mm = estimate_noise_mm(points_mm) if options.noise_mm is None else options.noise_mm
-    risks = []
+    some = deals.rows[:SCALE_SAMPLE]
+    apart = []
     for scale in SCALES:
-        found = optimal_radius(points_mm, noise_mm, _law(options, scale), rows=halves.rows)
-        risks.append(halves.risk(found.neighbours, reference))
-    return SCALES[int(np.argmin(risks))]
+        found = optimal_radius(points_mm, noise_mm, _law(options, scale), rows=some)
+        apart.append(abs(math.log(float(np.median(found.radius_mm)) / reach_mm)) if reach_mm > 0.0 else 0.0)
+    return SCALES[int(np.argmin(apart))]
+
+
+def _blend(
+    points_mm: Float64Array,
+    noise_mm: float,
+    options: NormalOptions,
+    deals: Deals,
+    reference: Reference,
+    tree: cKDTree,
+    scale: float,
+) -> tuple[float, int]:
+    """The exponent, one of EXPONENTS, and the number of neighbours, a step of the ladder, with the least risk."""
+    relative = _relative(optimal_radius(points_mm, noise_mm, _law(options, scale), rows=deals.rows).radius_mm)
+    ladder = deals.ladder
+    near_mm = np.asarray(tree.query(deals.at_mm, k=np.arange(1, ladder[-1] + 1))[0])
+    best, chosen = math.inf, (0.0, ladder[0])
+    for exponent in EXPONENTS:
+        for count in ladder:
+            radius = near_mm[:, count - 1] * relative**exponent
+            counts: Int64Array = np.maximum((near_mm < radius[:, None] * _REACHES).sum(axis=1), LEAST)
+            risk = deals.risk(counts, reference)
+            if risk < best:
+                best, chosen = risk, (exponent, count)
+    return chosen
+
+
+def _relative(radius_mm: Float64Array) -> Float64Array:
+    """Radii (n,) over their median; 1 where all are 0."""
+    middle = float(np.median(radius_mm))
+    return radius_mm / middle if middle > 0.0 else np.ones_like(radius_mm)
+
+
+def _reach(tree: cKDTree, at_mm: Float64Array, count: int) -> Float64Array:
+    """Distance in mm (m,) of places (m, 3) to the `count`-th nearest point, one that lies there counted."""
+    return np.asarray(tree.query(at_mm, k=[count])[0])[:, 0]
 
 
 def _law(options: NormalOptions, scale: float) -> RadiusLaw:

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from drivers.scanline import Float64Array
 from scanner_service.analysis.normals.choosing_count import choose_count
 from scanner_service.analysis.normals.field import NormalField, NormalOptions, Tell, tell_nobody
-from scanner_service.analysis.normals.fitting import fit_all
+from scanner_service.analysis.normals.fitting import Weighting, fit_all
 from scanner_service.analysis.normals.neighbourhoods import by_number
 from scanner_service.analysis.normals.within import fit_within
 
@@ -16,14 +16,18 @@ NAME = "orthogonal_distance"
 def orthogonal_distance(points_mm: Float64Array, options: NormalOptions, tell: Tell = tell_nobody) -> NormalField:
     """Normals of (n, 3) by orthogonal distance fits (Ahn 2004), the axis of the smallest central moment.
 
-    The neighbourhood is a stated radius or number of points; with neither the number is chosen for the cloud.
+    In a stated radius or number of points all weigh alike. With neither the number is chosen for the cloud, and points
+    weigh (1 - d²/r²)², which costs the least error for a number that is chosen (`Weighting.BIWEIGHT`).
     """
     if options.radius_mm is not None:
         return fit_within(NAME, points_mm, np.full(len(points_mm), options.radius_mm), options, tell)
     notes: tuple[str, ...] = ()
-    count = options.neighbours
+    count, weighting = options.neighbours, Weighting.EQUAL
     if count is None:
-        count = choose_count(points_mm)
+        weighting = Weighting.BIWEIGHT
+        count = choose_count(points_mm, weighting)
         notes = (f"{count} neighbours, chosen: two halves of the cloud agree best on normals with so many",)
     pieces = by_number(cKDTree(points_mm), points_mm, np.arange(len(points_mm)), count)
-    return fit_all(NAME, points_mm, pieces, max_error_rad=options.max_error_rad, tell=tell, notes=notes)
+    return fit_all(
+        NAME, points_mm, pieces, max_error_rad=options.max_error_rad, weighting=weighting, tell=tell, notes=notes
+    )

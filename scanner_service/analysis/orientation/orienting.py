@@ -14,7 +14,7 @@ from scanner_service.analysis.graphs.spanning import Float32Array, minimum_spann
 from scanner_service.analysis.orientation.evidence import Evidence, enclosed, weigh_components
 from scanner_service.analysis.orientation.links import CLEAR, Int8Array, LinkKind, judge_links
 from scanner_service.analysis.orientation.result import ComponentTable, Doubt, Orientation
-from scanner_service.analysis.orientation.rows import Int64Array, contradictions, first_places, turn_rows, unit_rows
+from scanner_service.analysis.orientation.rows import Int64Array, first_places, turn_rows, unit_rows, weigh_links
 from scanner_service.analysis.orientation.spreading import patches, spread
 
 GAP_FACTOR = 5.0
@@ -28,9 +28,6 @@ OPEN = 0.1
 
 FULL = 0.1
 """Below this fullness the enclosed volume does not tell inside from outside."""
-
-CONFIRMING = 2
-"""A point is sure only where so many links along the surface confirm its side: a single one may be a leap."""
 
 CONTRADICTING = 0.01
 """Above this share of contradicting links nothing is sure."""
@@ -85,10 +82,7 @@ def orient_normals(
     side = np.ones(len(row), dtype=np.int8)
     side[starts] = np.where(unit[starts, 2] < 0.0, -1, 1)
     spread(starts, web.links, web.sign, web.is_tree, side)
-    links, disagreeing, confirming = contradictions(
-        web.links, web.kind, web.sign, side, component, len(starts), sure
-    )
-    sure &= confirming >= CONFIRMING
+    links, disagreeing = weigh_links(web.links, web.kind, web.sign, side, component, len(starts), sure)
     area = web.area
     del web
     unit *= side[:, None]

