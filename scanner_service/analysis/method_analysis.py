@@ -1,7 +1,7 @@
 """One answer for every method on clouds without scanlines: normals, curvatures, reasons; knows no file and no job."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -10,6 +10,8 @@ from drivers.scanline import Float64Array, read_only
 from scanner_service.analysis.errors import MethodRefused, MethodUnknown
 from scanner_service.analysis.normals.estimating import METHODS, estimate_normals
 from scanner_service.analysis.normals.field import Int64Array, NormalOptions, NormalReason, Tell, tell_nobody
+from scanner_service.analysis.orientation import Orientation, orient_normals
+from scanner_service.analysis.orientation.telling import summarise_orientation, tell_orientation
 from scanner_service.analysis.quadrics.field import QuadricKind, QuadricReason
 from scanner_service.analysis.quadrics.local import NEEDED, SPARE_POINTS, local_quadrics
 from scanner_service.analysis.snapshot import UInt8Array
@@ -23,7 +25,8 @@ class MethodAnswer:
     """What a method says of n points.
 
     `normals` (n, 3), NaN where `reason` (n,), a number of `reasons`, is not 0. `scalars` are further values (n,) by
-    name with their unit, `vectors` (n, 3) further directions. `notes` say what was decided on the way.
+    name with their unit, `vectors` (n, 3) further directions. `notes` say what was decided on the way. `orientation`
+    is there when the normals were turned to one side of the surface.
     """
 
     method: str
@@ -34,6 +37,7 @@ class MethodAnswer:
     scalars: Mapping[str, Float64Array]
     vectors: Mapping[str, Float64Array]
     notes: tuple[str, ...]
+    orientation: Orientation | None = None
 
     def __post_init__(self) -> None:
         for values in (self.normals, *self.scalars.values(), *self.vectors.values()):
@@ -56,12 +60,15 @@ def analyse_by_method(
     options: NormalOptions | None = None,
     *,
     towards_mm: Float64Array | None = None,
+    orient: bool = False,
     tell: Tell = tell_nobody,
 ) -> MethodAnswer:
-    """Run a method of METHOD_NAMES on points (n, 3), and turn its normals towards a place.
+    """Run a method of METHOD_NAMES on points (n, 3), and turn its normals towards a place, or to one side.
 
     `towards_mm` is (3,) for all or (n, 3), one a point, such as the laser position of its scanline; without it normals
-    are turned to +z. Where curvatures are given their signs turn with the normal: positive bends towards it.
+    are turned to +z. With `orient` they are turned to the outside of the surface instead (`orient_normals`), and the
+    scalars say the component of each point and whether its side is known. Where curvatures are given their signs turn
+    with the normal: positive bends towards it.
 
     Raises
     ------
@@ -73,6 +80,8 @@ def analyse_by_method(
     points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 3)
     check_options(method, options)
     answer = _quadrics(points, method, options, tell) if method in QUADRICS else _normals(points, method, options, tell)
+    if orient:
+        return _oriented(answer, points)
     towards = np.array([0.0, 0.0, 1.0]) if towards_mm is None else towards_mm - points
     return _turned(answer, towards, towards_mm is None)
 
@@ -115,6 +124,20 @@ def _quadrics(points: Float64Array, method: str, options: NormalOptions, tell: T
 
 def _names(reasons: type[IntEnum]) -> tuple[str, ...]:
     return tuple(reason.name.lower() for reason in reasons)
+
+
+def _oriented(answer: MethodAnswer, points: Float64Array) -> MethodAnswer:
+    """The answer with its normals on one side of the surface; points without a normal have no component."""
+    if not (answer.reason == 0).any():
+        raise MethodRefused(
+            f"{answer.method} gives no point a normal, so there is nothing to orient: allow a larger error or radius"
+        )
+    found = orient_normals(points, answer.normals)
+    turned = _turned(answer, np.nan_to_num(found.normals), upwards=False)
+    has = found.component >= 0
+    told = {"component": np.where(has, found.component, np.nan), "sure": np.where(has, found.sure, np.nan)}
+    notes = (*turned.notes, *tell_orientation(found))
+    return replace(turned, scalars={**turned.scalars, **told}, notes=notes, orientation=found)
 
 
 def _turned(answer: MethodAnswer, towards: Float64Array, upwards: bool) -> MethodAnswer:
@@ -162,4 +185,5 @@ def summarise_answer(answer: MethodAnswer) -> dict[str, object]:
         "reasons": answer.counts,
         "notes": list(answer.notes),
         **spread,
+        **({} if answer.orientation is None else {"orientation": summarise_orientation(answer.orientation)}),
     }

@@ -246,6 +246,9 @@ class AnalysisIn(Strict):
     method: Annotated[str, Field(min_length=1, max_length=60, examples=["gaussian", "bivariate_quadric"])]
     source: Annotated[SessionPointsIn | FilePointsIn, Field(discriminator="kind")]
     options: MethodOptionsIn = MethodOptionsIn()
+    orient: Annotated[
+        bool, Field(description="Turn normals to the outside of the surface over a graph, and say how sure that is.")
+    ] = False
 
 
 class PassIn(Strict):

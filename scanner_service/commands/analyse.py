@@ -51,11 +51,13 @@ def analyse_command(
 ) -> None:
     """Analyse a cloud with a given radius or one of the chapter's rules, and write the result files."""
     with plain_errors():
+        if orient and seen_from is not None:
+            raise ValueError("--seen-from tells the side of each normal, --orient finds it: leave one of them out")
         stated: dict[str, object] = {"neighbours": neighbours, "noise": noise, "floor": floor, "ceiling": ceiling}
         stated |= {"ball-factor": ball_factor, "session": session}
         if method is not None:
             without: dict[str, object] = {"rule": rule, "max-radius": max_radius, "density": density}
-            refuse(without | {"orient": orient or None}, f"leave it out with --method {method}")
+            refuse(without, f"leave it out with --method {method}")
             options = NormalOptions(
                 radius_mm=radius,
                 neighbours=neighbours,
@@ -66,13 +68,11 @@ def analyse_command(
                 max_error_rad=math.radians(max_error),
             )
             analyse_file_by_method(
-                open_points(file, units, session), method, options, parse_position(seen_from), out, as_json
+                open_points(file, units, session), method, options, parse_position(seen_from), out, as_json, orient
             )
             return
         refuse(stated, "it belongs to --method")
         chosen = _rule(rule, radius)
-        if orient and seen_from is not None:
-            raise ValueError("--seen-from tells the side of each normal, --orient finds it: leave one of them out")
         check_folder(out)
         cloud = open_cloud(file, ReadOptions(parse_units(units)))
         position = parse_position(seen_from)

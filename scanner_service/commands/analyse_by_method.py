@@ -25,8 +25,9 @@ def analyse_file_by_method(
     seen_from_mm: tuple[float, float, float] | None,
     out: Path,
     as_json: bool,
+    orient: bool = False,
 ) -> None:
-    """Run the method, and write `points.ply` and `summary.json`.
+    """Run the method, and write `points.ply` and `summary.json`; with `orient` its normals are turned to one side.
 
     Raises
     ------
@@ -37,7 +38,7 @@ def analyse_file_by_method(
     check_folder(out)
     towards = cloud.laser_mm if seen_from_mm is None else np.array(seen_from_mm)
     with errors.status(f"{method} on {len(cloud.points_mm):,} points …"):
-        answer = analyse_by_method(cloud.points_mm, method, options, towards_mm=towards)
+        answer = analyse_by_method(cloud.points_mm, method, options, towards_mm=towards, orient=orient)
     notes = (*cloud.notes, *answer.notes)
     for note in notes:
         errors.print(f"note: {note}", highlight=False, soft_wrap=True)

@@ -38,12 +38,16 @@ class AnalysisPoints:
 
 @dataclass(frozen=True, slots=True)
 class AnalysisRequest:
-    """A method with its options on something that is read when the analysis begins; `source` names it."""
+    """A method with its options on something that is read when the analysis begins; `source` names it.
+
+    With `orient` the normals are turned to one side of the surface, not towards a place.
+    """
 
     method: str
     options: NormalOptions
     source: dict[str, str]
     read: Callable[[], AnalysisPoints]
+    orient: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +182,7 @@ class AnalysisBook:
             request.method,
             request.options,
             towards_mm=found.towards_mm,
+            orient=request.orient,
             tell=lambda share: self._progress(job_id, share),
         )
         points = np.array(found.points_mm)

@@ -39,6 +39,17 @@ def test_a_file_and_a_session_are_analysed_and_wrong_requests_are_refused(runnin
     assert ply.startswith(b"ply\n")
     assert b"property double scalar_curvature_1_per_mm" in ply
 
+    body = {"method": "fixed_radius", "source": {"kind": "file", "file": "ball.xyz"}, "orient": True}
+    body["options"] = {"radius_mm": 3.0, "max_error_deg": 30}
+    address = client.post("/api/v1/analyses", json=body).headers["Location"]
+    job = over(client, address)
+    assert job["state"] == "done", job
+    (component,) = job["summary"]["orientation"]["largest_components"]
+    assert (component["points"], component["confidence"], component["warning"]) == (500, 1.0, None)
+    page = client.get(f"{address}/points").json()
+    assert (np.sum(np.array(page["normals"]) * page["points_mm"], axis=1) > 0).all()
+    assert (set(page["component"]), set(page["sure"])) == ({0.0}, {1.0})
+
     session = service.create(kind="push")
     service.start(session)
     lines = [
@@ -60,8 +71,9 @@ def test_a_file_and_a_session_are_analysed_and_wrong_requests_are_refused(runnin
     np.testing.assert_allclose(np.array(normals), np.tile([0, 0, -1], (400, 1)), atol=1e-6)  # the laser stood below
 
     listed = client.get("/api/v1/analyses").json()
-    assert [item["id"] for item in listed["analyses"]] == ["a2", "a1"]
+    assert [item["id"] for item in listed["analyses"]] == ["a3", "a2", "a1"]
     for wrong, status, slug in (
+        ({"source": body["source"] | {"seen_from_mm": [0, 0, 9]}, "orient": True}, 422, "invalid-value"),
         ({"method": "magic"}, 422, "method-unknown"),
         ({"method": "gaussian", "options": {"ball_factor": 2}}, 422, "method-refused"),
         ({"options": {"radius_mm": 1, "neighbours": 9}}, 422, "invalid-value"),

@@ -75,9 +75,9 @@ def compare(
 ) -> list[Row]:
     """Run every contestant on every cloud at every noise level; all meet the same noise.
 
-    `tell` hears the share that is done and what comes next.
+    `tell` hears the share that is done and what comes next; first of all, what is compiled.
     """
-    _warm_up(contestants)
+    _warm_up(contestants, tell)
     rows: list[Row] = []
     total = len(clouds) * len(levels) * len(contestants)
     for cloud in clouds:
@@ -108,8 +108,9 @@ def _best(cloud: KnownCloud, points: Float64Array, level: NoiseLevel, contestant
     return best
 
 
-def _warm_up(contestants: Sequence[Contestant]) -> None:
-    """Compile what is to be compiled, outside of the measurement."""
+def _warm_up(contestants: Sequence[Contestant], tell: Callable[[float, str], None]) -> None:
+    """Compile what is to be compiled, outside of the measurement; the first time after an installation takes long."""
     points = sphere(200, np.random.default_rng(0)).points_mm
-    for contestant in contestants:
+    for number, contestant in enumerate(contestants, start=1):
+        tell(0.0, f"compiling {contestant.name}, {number} of {len(contestants)} (a minute in all, the first time only)")
         next(iter(contestant.settings.values()))(points)

@@ -85,9 +85,7 @@ def adaptive_radius(points_mm: Float64Array, options: NormalOptions, tell: Tell 
     )
 
 
-def _scale(
-    points_mm: Float64Array, noise_mm: float, options: NormalOptions, deals: Deals, reach_mm: float
-) -> float:
+def _scale(points_mm: Float64Array, noise_mm: float, options: NormalOptions, deals: Deals, reach_mm: float) -> float:
     """The scale, one of SCALES, for which the formula's median radius comes nearest to the one the cloud needs.
 
     The formula bounds the worst case, in which all the curvature of a neighbourhood lies on one side of the point. On

@@ -19,6 +19,7 @@ from scanner_service.analysis.normals.field import (
 from scanner_service.analysis.normals.neighbourhoods import Neighbourhoods
 from scanner_service.analysis.plane import smallest_axis
 
+
 class Weighting(IntEnum):
     """How a point at distance d within a neighbourhood of radius r weighs."""
 

@@ -59,16 +59,18 @@ def begin_analysis(request: Request, body: AnalysisIn) -> Response:
     except ValueError as error:
         raise ValueUnusable(str(error)) from None
     check_options(body.method, options)
+    if body.orient and isinstance(body.source, FilePointsIn) and body.source.seen_from_mm is not None:
+        raise ValueUnusable("seen_from_mm tells the side of each normal, orient finds it: leave one of them out")
     service = request.app.state.service
     source = body.source
     wanted = (
-        _session_points(book_of(request), source)
+        _session_points(book_of(request), source, body.orient)
         if isinstance(source, SessionPointsIn)
         else _file_points(service.replay_dir, source)
     )
     named: dict[str, str] = {"kind": source.kind}
     named |= {"session_id": source.session_id} if isinstance(source, SessionPointsIn) else {"file": source.file}
-    job = analyses_of(request).begin(AnalysisRequest(body.method, options, named, wanted))
+    job = analyses_of(request).begin(AnalysisRequest(body.method, options, named, wanted, body.orient))
     return answer(job_answer(job), 202, {"Location": f"/api/v1/analyses/{job.job_id}"})
 
 
@@ -134,7 +136,7 @@ def forget_analysis(request: Request, analysis_id: str) -> Response:
     return Response(status_code=204)
 
 
-def _session_points(book: SessionBook, source: SessionPointsIn) -> Callable[[], AnalysisPoints]:
+def _session_points(book: SessionBook, source: SessionPointsIn, orient: bool) -> Callable[[], AnalysisPoints]:
     """A function that reads the points of a session as they are when the analysis begins; raises SessionUnknown."""
     book.record.get_session(source.session_id)
 
@@ -143,7 +145,8 @@ def _session_points(book: SessionBook, source: SessionPointsIn) -> Callable[[], 
         if session.engine.ledger.counted > MAX_POINTS:
             raise ValueError(f"the session holds more than {MAX_POINTS:,} points: export it, and analyse a part")
         snapshot = session.engine.ask(lambda engine: engine.live_map.snapshot()).result()
-        note = f"session {source.session_id}: normals are turned to the laser of each point's own scanline"
+        whither = "over a graph, although each has a laser" if orient else "to the laser of each point's own scanline"
+        note = f"session {source.session_id}: normals are turned {whither}"
         return AnalysisPoints(snapshot.points_mm, snapshot.lines.laser_mm[snapshot.line], (note,))
 
     return read
