@@ -44,7 +44,7 @@ def make_cloud(points: int, seed: int = 1) -> tuple[Float64Array, Float64Array, 
 
 
 def ours(points_mm: Float64Array, radius_mm: float, threads: int) -> tuple[Float64Array, dict[str, float]]:
-    """Normals of planes within one radius, oriented over the Riemannian graph; as `scanner analyse --method` does it."""
+    """Normals of planes within one radius, oriented over the Riemannian graph, as `scanner analyse --method` does."""
     from scanner_service.analysis.normals.estimating import estimate_normals
     from scanner_service.analysis.normals.field import NormalOptions
     from scanner_service.analysis.orientation import orient_normals
