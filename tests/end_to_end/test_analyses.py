@@ -40,7 +40,7 @@ def test_a_file_and_a_session_are_analysed_and_wrong_requests_are_refused(runnin
     assert b"property double scalar_curvature_1_per_mm" in ply
 
     body = {"method": "fixed_radius", "source": {"kind": "file", "file": "ball.xyz"}, "orient": True}
-    body["options"] = {"radius_mm": 3.0, "max_error_deg": 30}
+    body["options"] = {"radius_mm": 5.0, "max_error_deg": 30}
     address = client.post("/api/v1/analyses", json=body).headers["Location"]
     job = over(client, address)
     assert job["state"] == "done", job
