@@ -13,7 +13,7 @@ from drivers.rig_file import parse_rig
 from drivers.stages.known import KNOWN as STAGES
 from drivers.stages.known import open_stage
 from scanner_service.api.login import login_router
-from scanner_service.api.routes import analyses, exports, health, live, passes, results, scanlines, sessions
+from scanner_service.api.routes import analyses, exports, files, health, live, passes, results, scanlines, sessions
 from scanner_service.api.scopes import route_table
 from scanner_service.cli import app
 from scanner_service.sessions.settings import SessionSettings
@@ -98,7 +98,7 @@ def test_every_setting_of_a_session_is_documented_with_its_default():
 def test_every_address_is_documented_with_its_role():
     service = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     service.include_router(login_router())
-    for module in (health, sessions, scanlines, results, passes, exports, live, analyses):
+    for module in (health, sessions, scanlines, results, passes, exports, live, analyses, files):
         service.include_router(module.router)
     declared = {
         (method, route.path, route.role.name.lower() if route.role else "public")
