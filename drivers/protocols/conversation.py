@@ -1,21 +1,22 @@
 """The host's half of a conversation with a scanner that runs free, whatever its protocol; no port, no clock, no thread.
 
 What is common to such scanners is here: meeting a device on each new link, starting, stopping, going on after a lost
-link, and the account of every profile. What a protocol has of its own are three scripts (`_greet`, `_begin`, `_end`),
-a decoder and `_take`, which makes profiles of what the stream brings.
+link. What a protocol has of its own are three scripts (`_greet`, `_begin`, `_end`), a decoder and `_take`, which makes
+profiles of what the stream brings; their account is kept by `profile_account.py`.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from drivers.errors import ScannerError, ScannerNotConnected, ScannerRefused
-from drivers.protocols.dialogue import Dialogue, Script
+from drivers.errors import ScannerError, ScannerNotConnected, ScannerRefused, ScannerSilent, ScannerTimeout
+from drivers.protocols.dialogue import Dialogue, Pause, Script
 from drivers.protocols.framing import Damage, DamageReason
+from drivers.protocols.profile_account import ProfileAccount
 from drivers.protocols.scanner_events import (
     Advice,
     ClockJumped,
@@ -27,10 +28,19 @@ from drivers.protocols.scanner_events import (
     ScannerEvent,
 )
 from drivers.scanline import BoolArray, DeviceInfo, Float64Array, Profile
-from drivers.tally import BootLedger, Kind, Tally
+from drivers.tally import Tally
 
-_U32 = 1 << 32
-_MAX_SKIP = 1 << 30  # a gap that is said to be longer is no gap but nonsense
+_Found = TypeVar("_Found")
+
+
+class Decoder(Protocol):
+    """Bytes in, items and Damage out."""
+
+    def receive(self, data: bytes) -> Sequence[Any]:
+        """What these bytes complete."""
+
+    def reset(self) -> int:
+        """Forget what has begun; return how many bytes that were."""
 
 
 class Phase(Enum):
@@ -58,6 +68,7 @@ class Conversation(ABC):
     ----------
     deliver : takes a profile; False when it could not, which is counted as `host_overflow`.
     emit : takes an event.
+    decoder : understands the device's bytes.
     boot_id : names this conversation in the record; the devices of these protocols have no number for their boots.
     rates : baud rates to try, the likeliest first.
     """
@@ -72,6 +83,7 @@ class Conversation(ABC):
         self,
         deliver: Callable[[Profile], bool],
         emit: Callable[[ScannerEvent], None],
+        decoder: Decoder,
         *,
         boot_id: int,
         rates: tuple[int, ...],
@@ -91,14 +103,13 @@ class Conversation(ABC):
         self.heard_bytes = 0
         self._heard_s = 0.0
         self.boot_id = boot_id
-        self.pass_index = 0
         self._rates = rates
+        self._decoder = decoder
         self._deliver = deliver
         self._emit = emit
         self._dialogue: Dialogue | None = None
         self._task: Task | None = None
-        self._ledger = BootLedger()
-        self._next_line = 0
+        self._account = ProfileAccount(boot_id)
         self._told_jumps = 0
         self._streaming = False
         self._wanted = False
@@ -106,27 +117,30 @@ class Conversation(ABC):
         self._other_id = ""
         self._lost_s: float | None = None
         self._profile_s = 0.0
-        self._timed_s = 0.0
-        self._timed_pass = 0
         self._in_trouble: str | None = None
 
     # ---- what a protocol brings -----------------------------------------------------------------------------------
 
-    @abstractmethod
-    def _decode(self, data: bytes, now_s: float) -> list[Any]:
+    def _decode(self, data: bytes, now_s: float) -> Sequence[Any]:
         """Items and Damage that these bytes complete."""
+        return self._decoder.receive(data)
 
-    @abstractmethod
     def _reset_decoder(self) -> list[Damage]:
         """Forget what has begun; return it as damage."""
+        n_bytes = self._decoder.reset()
+        return [Damage(DamageReason.CUT_OFF, n_bytes)] if n_bytes else []
 
-    def _break_off(self) -> list[Any]:
+    def _break_off(self) -> Sequence[Any]:
         """What can be understood when the rest of the frame under way will not come; the decoder may keep nothing."""
-        return []
+        return ()
 
     @abstractmethod
     def _greet(self) -> Script[DeviceInfo]:
         """End what an earlier program left running, find the rate, ask who is there."""
+
+    @abstractmethod
+    def _nobody(self, tried: str, *, heard: bool) -> str:
+        """One sentence on why nobody was met at the rates `tried`; `heard` tells whether anything came at all."""
 
     @abstractmethod
     def _begin(self) -> Script[None]:
@@ -162,7 +176,7 @@ class Conversation(ABC):
         for damage in self._reset_decoder():
             self._damage(damage)
         self._close_line(now_s)
-        self._ledger.link_lost()
+        self._account.link_lost()
         self._fail_task(ScannerNotConnected(reason))
         self._streaming = False
         self.laser_on = None
@@ -174,7 +188,7 @@ class Conversation(ABC):
         self._emit(Disconnected(reason, now_s))
         if self._wanted and not self._resume:
             self._wanted = False
-            self._emit(PassEnded(self.pass_index, "disconnected"))
+            self._pass_ended("disconnected")
             self._emit(PassNotResumed("the link was lost, and this pass was not to go on by itself"))
 
     def end(self) -> None:
@@ -184,6 +198,11 @@ class Conversation(ABC):
         self._wanted = self._streaming = False
         self.laser_on = None
         self.phase = Phase.CLOSED
+
+    @property
+    def pass_index(self) -> int:
+        """The pass that runs, or ran last; 0 before the first."""
+        return self._account.pass_index
 
     @property
     def is_met(self) -> bool:
@@ -232,7 +251,7 @@ class Conversation(ABC):
             task.done, task.failure = True, ScannerRefused("the scanner is measuring already; stop it first")
             self._task = None
             return task
-        self.pass_index += 1
+        self._account.begin_pass()
         self._wanted, self._resume = True, resume
         self._streaming = True
         self._profile_s = now_s
@@ -249,7 +268,7 @@ class Conversation(ABC):
         """End the stream; it will not go on by itself, whatever happens."""
         was_wanted, self._wanted = self._wanted, False
         if was_wanted and self.phase is not Phase.UP:
-            self._emit(PassEnded(self.pass_index, "stopped"))
+            self._pass_ended("stopped")
         if self._task is not None:
             self._fail_task(ScannerRefused("the scanner was stopped meanwhile"))
         task = self._new_task()
@@ -269,7 +288,7 @@ class Conversation(ABC):
 
     def tally(self) -> Tally:
         """The accounts so far."""
-        return self._ledger.tally()
+        return self._account.tally()
 
     # ---- for the protocols ----------------------------------------------------------------------------------------
 
@@ -282,17 +301,7 @@ class Conversation(ABC):
     def _damage(self, damage: Damage) -> None:
         """Enter damage, once there is a device whose account it can be."""
         if self.info is not None:
-            self._ledger.damage(damage.reason.value, damage.n_bytes)
-
-    def _lost_lines(self, n_lines: int) -> None:
-        """Profiles that the device made and that did not arrive; their reason is what happened on the wire."""
-        self._next_line += min(max(n_lines, 0), _MAX_SKIP)
-
-    def _lost_by_time(self, device_time_s: float, period_s: float) -> None:
-        """Enter the profiles that are missing before one of `device_time_s`, of a scanner that makes one a period."""
-        if self._timed_pass == self.pass_index:
-            self._lost_lines(round((device_time_s - self._timed_s) / period_s) - 1)
-        self._timed_s, self._timed_pass = device_time_s, self.pass_index
+            self._account.damage(damage)
 
     def _fault(self, text: str) -> None:
         """The device itself has stopped measuring; `text` is one sentence."""
@@ -300,13 +309,7 @@ class Conversation(ABC):
         self._streaming = False
         if self._wanted:
             self._wanted = False
-            self._emit(PassEnded(self.pass_index, "fault"))
-
-    def _enter_line(self, dropped_lines: int = 0) -> bool:
-        """Enter the next profile into the account; `dropped_lines` of those lost so far the device dropped itself."""
-        number, dropped = self._next_line % _U32, dropped_lines % _U32
-        self._next_line += 1
-        return self._ledger.chunk(number, number, dropped, dropped).kind is Kind.NEW
+            self._pass_ended("fault")
 
     def _jumped(self, jumps: int) -> None:
         """Tell of jumps of the device's clock, `jumps` of them so far."""
@@ -330,7 +333,7 @@ class Conversation(ABC):
             device_id=self.info.device_id,
             boot_id=self.boot_id,
             pass_index=self.pass_index,
-            line_index=self._next_line - 1,
+            line_index=self._account.latest_line,
             device_time_s=device_time_s,
             arrival_s=now_s,
             x_mm=x_mm,
@@ -342,12 +345,43 @@ class Conversation(ABC):
             step_mm=float(np.nan),
         )
         if self._deliver(profile):
-            self._ledger.line_closed(whole=profile.is_whole)
-            self._ledger.no_return(no_return)
+            self._account.handed_on(no_return, whole=profile.is_whole)
         else:
-            self._ledger.line_not_kept("host_overflow", 1)
+            self._account.not_taken()
 
-    def _hear(self, items: list[Any], now_s: float) -> None:
+    def _find_rate(self, meet: Callable[[], Script[_Found | None]]) -> Script[_Found]:
+        """Try the rates one after the other, the present one first, until `meet` brings something.
+
+        Raises
+        ------
+        ScannerSilent : it never does.
+        """
+        before = self.heard_bytes
+        for rate in dict.fromkeys((self.baud_rate, *self._rates)):
+            self.baud_rate = rate
+            found = yield from meet()
+            if found:
+                return found
+        tried = ", ".join(map(str, dict.fromkeys(self._rates)))
+        raise ScannerSilent(self._nobody(tried, heard=self.heard_bytes > before))
+
+    def _settle_at(self, new: int, old: int, meet: Callable[[], Script[bool]]) -> Script[None]:
+        """The device has agreed to a new rate: go there, and back where it cannot be understood.
+
+        Raises
+        ------
+        ScannerTimeout : it answers at neither rate.
+        """
+        for rate in (new, old):
+            self.baud_rate = rate
+            yield Pause(0.05)
+            if (yield from meet()):
+                if rate == old:
+                    self._advise(f"the scanner agreed to {new} baud and cannot be understood there; it stays at {old}")
+                return
+        raise ScannerTimeout(f"the scanner went to {new} baud and does not answer any more; switch it off and on")
+
+    def _hear(self, items: Sequence[Any], now_s: float) -> None:
         for item in items:
             if isinstance(item, Damage):
                 self._damage(item)
@@ -406,7 +440,11 @@ class Conversation(ABC):
         self._close_line(now_s)
         self._streaming = False
         if was_wanted:
-            self._emit(PassEnded(self.pass_index, reason))
+            self._pass_ended(reason)
+
+    def _pass_ended(self, reason: str) -> None:
+        self._account.end_pass()
+        self._emit(PassEnded(self.pass_index, reason))
 
     def _met(self, info: DeviceInfo, now_s: float) -> None:
         if self.info is not None and info.device_id != self.info.device_id:
@@ -442,6 +480,3 @@ class Conversation(ABC):
     def _unmet(self, error: ScannerError, _now_s: float) -> None:
         self.failure = error
         self.phase = Phase.UNMET
-
-    def _cut_off(self, n_bytes: int) -> list[Damage]:
-        return [Damage(DamageReason.CUT_OFF, n_bytes)] if n_bytes else []
