@@ -2,20 +2,20 @@
 
 What is common to such scanners is here: meeting a device on each new link, starting, stopping, going on after a lost
 link. What a protocol has of its own are three scripts (`_greet`, `_begin`, `_end`), a decoder and `_take`, which makes
-profiles of what the stream brings; their account is kept by `profile_account.py`.
+profiles of what the stream brings. The scripts run in `talk.py`, the account is kept by `profile_account.py`.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 
-from drivers.errors import ScannerError, ScannerNotConnected, ScannerRefused, ScannerSilent, ScannerTimeout
-from drivers.protocols.dialogue import Dialogue, Pause, Script
-from drivers.protocols.framing import Damage, DamageReason
+from drivers.errors import ScannerError, ScannerNotConnected, ScannerRefused
+from drivers.protocols.dialogue import Script
+from drivers.protocols.framing import Damage
 from drivers.protocols.profile_account import ProfileAccount
 from drivers.protocols.scanner_events import (
     Advice,
@@ -27,20 +27,9 @@ from drivers.protocols.scanner_events import (
     Reconnected,
     ScannerEvent,
 )
+from drivers.protocols.talk import Decoder, Talk
 from drivers.scanline import BoolArray, DeviceInfo, Float64Array, Profile
 from drivers.tally import Tally
-
-_Found = TypeVar("_Found")
-
-
-class Decoder(Protocol):
-    """Bytes in, items and Damage out."""
-
-    def receive(self, data: bytes) -> Sequence[Any]:
-        """What these bytes complete."""
-
-    def reset(self) -> int:
-        """Forget what has begun; return how many bytes that were."""
 
 
 class Phase(Enum):
@@ -61,7 +50,7 @@ class Task:
     failure: ScannerError | None = None
 
 
-class Conversation(ABC):
+class Conversation(Talk):
     """One conversation with one device, over as many links as it takes.
 
     Parameters
@@ -76,9 +65,6 @@ class Conversation(ABC):
     silent_after_s = 2.0
     """A stream without a profile for so long has stopped: the link is then opened anew."""
 
-    break_after_s: float | None = None
-    """A pause inside a frame after which its rest will not come; None where a frame says itself where it ends."""
-
     def __init__(
         self,
         deliver: Callable[[Profile], bool],
@@ -88,26 +74,15 @@ class Conversation(ABC):
         boot_id: int,
         rates: tuple[int, ...],
     ) -> None:
-        if not rates or min(rates) <= 0:
-            raise ValueError(f"baud rates must be greater than 0, not {rates}")
-        self.outgoing = bytearray()
-        self.baud_rate = rates[0]
-        """What the port is to be set to now."""
-        self.dtr: bool | None = None
-        """How DTR is to stand now; None leaves it."""
+        super().__init__(decoder, lambda text: emit(Advice(text)), rates)
         self.info: DeviceInfo | None = None
         self.phase = Phase.CLOSED
         self.failure: ScannerError | None = None
         """Why nobody was met on this link."""
         self.laser_on: bool | None = None
-        self.heard_bytes = 0
-        self._heard_s = 0.0
         self.boot_id = boot_id
-        self._rates = rates
-        self._decoder = decoder
         self._deliver = deliver
         self._emit = emit
-        self._dialogue: Dialogue | None = None
         self._task: Task | None = None
         self._account = ProfileAccount(boot_id)
         self._told_jumps = 0
@@ -121,26 +96,9 @@ class Conversation(ABC):
 
     # ---- what a protocol brings -----------------------------------------------------------------------------------
 
-    def _decode(self, data: bytes, now_s: float) -> Sequence[Any]:
-        """Items and Damage that these bytes complete."""
-        return self._decoder.receive(data)
-
-    def _reset_decoder(self) -> list[Damage]:
-        """Forget what has begun; return it as damage."""
-        n_bytes = self._decoder.reset()
-        return [Damage(DamageReason.CUT_OFF, n_bytes)] if n_bytes else []
-
-    def _break_off(self) -> Sequence[Any]:
-        """What can be understood when the rest of the frame under way will not come; the decoder may keep nothing."""
-        return ()
-
     @abstractmethod
     def _greet(self) -> Script[DeviceInfo]:
         """End what an earlier program left running, find the rate, ask who is there."""
-
-    @abstractmethod
-    def _nobody(self, tried: str, *, heard: bool) -> str:
-        """One sentence on why nobody was met at the rates `tried`; `heard` tells whether anything came at all."""
 
     @abstractmethod
     def _begin(self) -> Script[None]:
@@ -154,11 +112,8 @@ class Conversation(ABC):
     def _take(self, item: Any, now_s: float) -> None:
         """Take an item of the stream that no script waited for."""
 
-    def _close_line(self, now_s: float) -> None:  # noqa: B027 - only some protocols collect a profile from pieces
+    def _close_line(self, now_s: float) -> None:
         """Hand on the profile that is being collected, if there is one."""
-
-    def _poll(self, now_s: float) -> None:  # noqa: B027 - only some protocols have to ask again and again
-        """Do what is due by now."""
 
     # ---- the link -------------------------------------------------------------------------------------------------
 
@@ -221,25 +176,6 @@ class Conversation(ABC):
             return f"no profile has come for {self.silent_after_s:g} s; check the scanner's power and its cable"
         return None
 
-    def receive(self, data: bytes, now_s: float) -> None:
-        """Take bytes from the device."""
-        if not data:
-            return
-        self.heard_bytes += len(data)
-        if self._dialogue is not None:
-            self._dialogue.heard(now_s)
-        self._heard_s = now_s
-        self._hear(self._decode(data, now_s), now_s)
-
-    def tick(self, now_s: float) -> None:
-        """Do what is due by now."""
-        if self.break_after_s is not None and now_s - self._heard_s > self.break_after_s:
-            self._hear(self._break_off(), now_s)
-        if self._dialogue is not None:
-            self._dialogue.tick(now_s)
-        if self.phase is not Phase.CLOSED:
-            self._poll(now_s)
-
     # ---- commands -------------------------------------------------------------------------------------------------
 
     def start(self, now_s: float, *, resume: bool) -> Task:
@@ -292,16 +228,14 @@ class Conversation(ABC):
 
     # ---- for the protocols ----------------------------------------------------------------------------------------
 
-    def _say(self, data: bytes) -> None:
-        self.outgoing += data
-
-    def _advise(self, text: str) -> None:
-        self._emit(Advice(text))
-
     def _damage(self, damage: Damage) -> None:
         """Enter damage, once there is a device whose account it can be."""
         if self.info is not None:
             self._account.damage(damage)
+
+    def _unasked(self, item: Any, now_s: float) -> None:
+        if self._streaming:
+            self._take(item, now_s)
 
     def _fault(self, text: str) -> None:
         """The device itself has stopped measuring; `text` is one sentence."""
@@ -349,71 +283,7 @@ class Conversation(ABC):
         else:
             self._account.not_taken()
 
-    def _find_rate(self, meet: Callable[[], Script[_Found | None]]) -> Script[_Found]:
-        """Try the rates one after the other, the present one first, until `meet` brings something.
-
-        Raises
-        ------
-        ScannerSilent : it never does.
-        """
-        before = self.heard_bytes
-        for rate in dict.fromkeys((self.baud_rate, *self._rates)):
-            self.baud_rate = rate
-            found = yield from meet()
-            if found:
-                return found
-        tried = ", ".join(map(str, dict.fromkeys(self._rates)))
-        raise ScannerSilent(self._nobody(tried, heard=self.heard_bytes > before))
-
-    def _settle_at(self, new: int, old: int, meet: Callable[[], Script[bool]]) -> Script[None]:
-        """The device has agreed to a new rate: go there, and back where it cannot be understood.
-
-        Raises
-        ------
-        ScannerTimeout : it answers at neither rate.
-        """
-        for rate in (new, old):
-            self.baud_rate = rate
-            yield Pause(0.05)
-            if (yield from meet()):
-                if rate == old:
-                    self._advise(f"the scanner agreed to {new} baud and cannot be understood there; it stays at {old}")
-                return
-        raise ScannerTimeout(f"the scanner went to {new} baud and does not answer any more; switch it off and on")
-
-    def _hear(self, items: Sequence[Any], now_s: float) -> None:
-        for item in items:
-            if isinstance(item, Damage):
-                self._damage(item)
-            elif not (self._dialogue is not None and self._dialogue.offer(item, now_s)) and self._streaming:
-                self._take(item, now_s)
-
     # ---- inside ---------------------------------------------------------------------------------------------------
-
-    def _run(
-        self,
-        script: Script[Any],
-        now_s: float,
-        done: Callable[[Any, float], None],
-        failed: Callable[[ScannerError, float], None],
-    ) -> None:
-        self._abandon_dialogue()
-
-        def is_done(result: object, at_s: float) -> None:
-            self._dialogue = None
-            done(result, at_s)
-
-        def has_failed(error: ScannerError, at_s: float) -> None:
-            self._dialogue = None
-            failed(error, at_s)
-
-        self._dialogue = dialogue = Dialogue(script, now_s, is_done, has_failed)
-        dialogue.begin(now_s)
-
-    def _abandon_dialogue(self) -> None:
-        dialogue, self._dialogue = self._dialogue, None
-        if dialogue is not None:
-            dialogue.abandon()
 
     def _new_task(self) -> Task:
         self._task = Task()
