@@ -34,6 +34,8 @@ from simulators.parts import plate
 from simulators.pty_port import PtyPort, SerialDevice
 
 _PATIENCE_S = 120.0
+_TICK_S = 0.05
+_PAUSED_S = 0.5
 _NATIVE_RATE = 3_000_000
 _STAGE_RATE = 115_200
 _STAGES: dict[str, Callable[[], SerialDevice]] = {"grbl": GrblDevice, "marlin": MarlinDevice, "zaber": ZaberDevice}
@@ -85,6 +87,35 @@ class StageSubject:
     def told(self) -> dict[str, object]:
         """Whether it still knows where it is."""
         return {"position_known": self.stage.position_known}
+
+
+class Pauses:
+    """Notes when this process as a whole was not let run: a machine that is shared, or a debugger."""
+
+    def __init__(self) -> None:
+        self.longest_s = 0.0
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> "Pauses":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def reset(self) -> float:
+        """The longest pause since the last call, in seconds."""
+        longest, self.longest_s = self.longest_s, 0.0
+        return longest
+
+    def _watch(self) -> None:
+        before = time.monotonic()
+        while not self._over.wait(_TICK_S):
+            now = time.monotonic()
+            self.longest_s = max(self.longest_s, now - before - _TICK_S)
+            before = now
 
 
 def descriptors() -> int:
@@ -142,8 +173,12 @@ def pull_and_return(kind: str, cycles: int, link: Path) -> dict[str, object]:
     """Pull the cable `cycles` times; seconds from its return until the first line or reading."""
     device, rate = device_of(kind, is_fast=False)
     back_s: list[float] = []
+    paused: list[float] = []
     before = threading.active_count(), descriptors()
-    with PtyPort(device, rate, rng=np.random.default_rng(2), heeds_client_rate=True, link_path=link) as port:
+    with (
+        Pauses() as pauses,
+        PtyPort(device, rate, rng=np.random.default_rng(2), heeds_client_rate=True, link_path=link) as port,
+    ):
         subject, driver = enter(kind, str(link), rate, 200.0)
         threads, files = threading.active_count(), descriptors()
         for number in range(cycles):
@@ -151,11 +186,13 @@ def pull_and_return(kind: str, cycles: int, link: Path) -> dict[str, object]:
             time.sleep(0.05 + 0.002 * (number % 7))  # it comes back at different moments of the driver's round
             subject.fetch(0.0)
             port.replug()
+            pauses.reset()
             begun_s = time.monotonic()
             while not subject.fetch(0.01):
                 if time.monotonic() - begun_s > _PATIENCE_S:
                     raise TimeoutError(f"not back after {_PATIENCE_S} s")
-            back_s.append(time.monotonic() - begun_s)
+            took_s, pause_s = time.monotonic() - begun_s, pauses.reset()
+            (paused if pause_s > _PAUSED_S else back_s).append(took_s)
         during = {"threads": threading.active_count() - threads, "descriptors": descriptors() - files}
         told = subject.told()
         driver.exit()
@@ -163,6 +200,7 @@ def pull_and_return(kind: str, cycles: int, link: Path) -> dict[str, object]:
     p50, p99 = np.percentile(back_s, [50, 99])
     return {
         "cycles": cycles,
+        "while_the_process_was_paused_s": [round(took_s, 3) for took_s in paused],
         "back_s": {"p50": round(p50, 3), "p99": round(p99, 3), "max": round(max(back_s), 3)},
         "left_behind": during,
         "left_behind_after_exit": after,

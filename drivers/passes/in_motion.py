@@ -11,6 +11,8 @@ from drivers.scanners.face import FreeRunningScanner
 from drivers.stages.unmoved import ConstantSpeed
 
 _BACK_S = 120.0
+_ARRIVAL_S = 0.3
+"""A stage is asked a few times a second whether it has arrived; a scanner that runs free goes on meanwhile."""
 _COUNT_SLACK = 0.02
 """Share by which the spacing that clock and speed tell may differ from the one that was counted with."""
 
@@ -23,6 +25,7 @@ class MotionPass:
         self._scanner = scanner
         self._by_count = drive.pairs_by is PairBy.COUNT
         self._speed = 0.0
+        self._counted_mm = math.nan  # up to the last round before the stage arrived
 
     def run(self) -> None:
         """Move from end to end while the scanner measures; raises a DriverError when stage or scanner fail."""
@@ -51,6 +54,7 @@ class MotionPass:
             drive.stage_events()
             if arrived or self._is_beyond():
                 break
+            self._counted_mm = lines.counted_to_mm
         if drive.driven is not None and not drive.stopping.is_set() and not self._by_count:
             drive.await_reading(profiles_too=True)
         lines.settle(is_over=True)
@@ -96,14 +100,14 @@ class MotionPass:
                     f"{order.line_spacing_mm:g} mm; order that spacing, or pair by time"
                 )
             )
-        latest, last_mm = drive.lines.track.latest, drive.lines.last_mm
-        if drive.driven is None or latest is None or math.isnan(last_mm):
+        latest = drive.lines.track.latest
+        if drive.driven is None or latest is None:
             return
-        off_mm = abs(latest.position_mm - last_mm)
-        if off_mm > 2.0 * order.line_spacing_mm:
+        slack_mm = 2.0 * order.line_spacing_mm + self._speed * _ARRIVAL_S
+        if abs(latest.position_mm - self._counted_mm) > slack_mm:
             drive.told.event(
                 Advice(
-                    f"the last line was counted to {last_mm:.4g} mm, but the stage stands at "
+                    f"the last line was counted to {self._counted_mm:.4g} mm, but the stage stands at "
                     f"{latest.position_mm:.4g} mm: lines and places do not match; check the trigger, or pair by time"
                 )
             )

@@ -39,6 +39,8 @@ class PassLines:
         self._counted_from_mm = math.nan
         self._counted_since_s = math.inf
         self._first_counted: int | None = None
+        self.counted_to_mm = math.nan
+        """The place that the latest counted profile came to, also beyond the end of the pass; NaN before the first."""
         self._counted_times: deque[float] = deque(maxlen=1_000)
 
     # ---- profiles come in -------------------------------------------------------------------------------------------
@@ -67,6 +69,7 @@ class PassLines:
             self._first_counted = profile.line_index
         spacing_mm = self.order.line_spacing_mm
         at_mm = self._counted_from_mm + self.order.sign * (profile.line_index - self._first_counted) * spacing_mm
+        self.counted_to_mm = at_mm
         if (at_mm - self.order.end_mm) * self.order.sign > 0.5 * spacing_mm:
             self.leave_out(profile, "outside_pass")
             return
