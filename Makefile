@@ -27,7 +27,12 @@ demo: $(VENV)/installed
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
 
-test-long: $(VENV)/installed-dev
+# Emulators that others wrote, in an environment of their own: OctoPrint (AGPL) is a tool of the tests, never imported.
+$(VENV)/emulators: $(VENV)/installed
+	-$(PYTHON) -m venv $(VENV)/octoprint && $(VENV)/octoprint/bin/python -m pip install --quiet --disable-pip-version-check 'octoprint==1.11.8'
+	@touch $@
+
+test-long: $(VENV)/installed-dev $(VENV)/emulators
 	$(BIN)/python -m pytest -m long --timeout 3600 $(ARGS)
 
 # Coverage-guided, one parser after the other; what it finds interesting stays in tests/fuzz/corpus.

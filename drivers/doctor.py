@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from drivers.errors import DriverError, PortBusy, PortError, PortNotPermitted
+from drivers.errors import DriverError, PortAbsent, PortError, PortNotSerial
 from drivers.port import Port
 from drivers.port_names import PortName, find_port, list_ports
 from drivers.rig_description import DeviceChoice, PairBy, RigDescription
@@ -72,9 +72,11 @@ def check_port(port: PortName) -> list[Finding]:
     findings: list[Finding] = []
     try:
         Port(port.path, 115_200).close()
-    except (PortNotPermitted, PortBusy, PortError) as error:
+    except PortError as error:
         found, _, remedy = str(error).partition("; ")
         findings.append(Finding(Level.PROBLEM, port.path, found, remedy or "see the message"))
+        if not port.driver and isinstance(error, PortAbsent | PortNotSerial):  # no port: no more can be said of it
+            return findings
     else:
         told = f"{port.product or port.driver or 'a serial port'}, can be opened"
         findings.append(Finding(Level.GOOD, port.path, f"{told}; name it {port.lasting}"))

@@ -6,7 +6,7 @@ that the smallest difference between the two clocks is the offset, and the jitte
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from drivers.rig_description import Pairing
@@ -155,15 +155,18 @@ class TimePairing:
     """Profiles of one pass, waiting for the readings around them.
 
     At any moment `received == paired + waiting + sum(left_out.values())`. Reasons: `no_position` (no two readings lie
-    around it), `queue_full` (too many wait for readings that do not come).
+    around it), `queue_full` (too many wait for readings that do not come); `on_left_out` is told of each.
     """
 
-    def __init__(self, pairing: Pairing) -> None:
+    def __init__(
+        self, pairing: Pairing, on_left_out: Callable[[Profile, str], None] = lambda _profile, _why: None
+    ) -> None:
         self.track = StageTrack()
         self.clock = ClockOffset()
         self.received = self.paired = 0
         self.left_out: Counter[str] = Counter()
         self._pairing = pairing
+        self._on_left_out = on_left_out
         self._waiting: deque[Profile] = deque()
 
     @property
@@ -180,8 +183,7 @@ class TimePairing:
         self.received += 1
         self.clock.enter(profile.device_time_s, profile.arrival_s)
         if len(self._waiting) >= MAX_WAITING:
-            self._waiting.popleft()
-            self.left_out["queue_full"] += 1
+            self._leave_out(self._waiting.popleft(), "queue_full")
         self._waiting.append(profile)
 
     def due(self, *, no_more_readings: bool = False) -> list[PairedProfile]:
@@ -196,9 +198,13 @@ class TimePairing:
             self._waiting.popleft()
             at = self.track.at(time_s, self._pairing.latency_uncertainty_s)
             if at is None:
-                self.left_out["no_position"] += 1
+                self._leave_out(profile, "no_position")
                 continue
             self.paired += 1
             found.append(PairedProfile(profile, at))
             self.track.forget_before(time_s)
         return found
+
+    def _leave_out(self, profile: Profile, reason: str) -> None:
+        self.left_out[reason] += 1
+        self._on_left_out(profile, reason)

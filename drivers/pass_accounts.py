@@ -12,7 +12,8 @@ class PassReport:
     """The accounts of one pass: `profiles == lines + sum(left_out.values())`.
 
     `left_out` is by reason: `no_position`, `queue_full` (see `TimePairing`), `outside_pass` (run-up and overrun),
-    `between_stops` (measured while the stage was on its way to the next line), `overflow` (nobody fetched it).
+    `between_stops` (measured while the stage was on its way to the next line), `before_start` (lines are counted, and
+    the stage had not set off), `overflow` (nobody fetched it).
     Uncertainties and steps are NaN without lines; steps are measured, between one line and the next.
     """
 

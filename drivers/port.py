@@ -60,7 +60,7 @@ class Port:
 
     def __init__(self, path: str, baud_rate: int, lines: ModemLines = LEAVE_LINES) -> None:
         self.path = path
-        _check_device_file(path)
+        check_device_file(path)
         try:
             self._serial = serial.Serial(None, baud_rate, timeout=0, write_timeout=0, exclusive=True)
             self._serial.port = path
@@ -204,7 +204,8 @@ def _rate_refused(path: str, baud_rate: int, error: Exception) -> PortRateRefuse
     )
 
 
-def _check_device_file(path: str) -> None:
+def check_device_file(path: str) -> None:
+    """Raise a PortError when `path` cannot be a serial port; nothing is opened."""
     if "\0" in path or not Path(path).is_absolute():
         raise PortNotSerial(path, f"{path!r} is no path of a serial device; give one such as /dev/ttyUSB0")
     try:
@@ -221,13 +222,14 @@ def _explain(path: str, error: OSError) -> PortError:
     if number is None and isinstance(error.__context__, termios.error):
         number = error.__context__.args[0]  # pyserial drops the number where the attributes cannot be read
     if number in _GONE:
-        return PortAbsent(path, f"{path} does not exist or is not connected; plug the scanner in and check the path")
+        where = "plug the device in and check the path (`scanner devices` lists the ports there are)"
+        return PortAbsent(path, f"{path} does not exist or is not connected; {where}")
     if number in {errno.EACCES, errno.EPERM}:
         return PortNotPermitted(path, f"you may not open {path}; {_remedy(path)}")
     if number in {errno.EAGAIN, errno.EBUSY}:
         return PortBusy(path, f"{path} is held by another program; close that program and try again")
     if number in {errno.ENOTTY, errno.EINVAL, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG}:
-        return PortNotSerial(path, f"{path} is not a serial device ({error}); give one such as /dev/ttyUSB0")
+        return PortNotSerial(path, f"{path} is not a serial device; give one such as /dev/ttyUSB0")
     return PortError(path, f"{path} could not be opened: {error}")
 
 

@@ -128,4 +128,18 @@ class PassOrder:
     @property
     def line_count(self) -> int:
         """Lines of the pass, both ends included."""
-        return math.floor(abs(self.end_mm - self.start_mm) / self.line_spacing_mm + 1e-9) + 1
+        return lines_between(self.start_mm, self.end_mm, self.line_spacing_mm)
+
+    @property
+    def sign(self) -> float:
+        """+1 where positions grow along the pass, -1 where they fall."""
+        return 1.0 if self.end_mm > self.start_mm else -1.0
+
+    def position_mm(self, number: int) -> float:
+        """Return where the line of that number belongs, the first being 0."""
+        return self.start_mm + self.sign * number * self.line_spacing_mm
+
+
+def lines_between(start_mm: float, end_mm: float, line_spacing_mm: float) -> int:
+    """Return how many lines lie `line_spacing_mm` apart from `start_mm` towards `end_mm`, both ends included."""
+    return math.floor(abs(end_mm - start_mm) / line_spacing_mm + 1e-9) + 1

@@ -1,11 +1,11 @@
 """The host's half of a conversation with a scanner that runs free, whatever its protocol; no port, no clock, no thread.
 
 What is common to such scanners is here: meeting a device on each new link, starting, stopping, going on after a lost
-link, and the account of every profile. What a protocol has of its own are three scripts (`_greet`, `_begin`, `_end`),
-a decoder and `_take`, which makes profiles of what the stream brings.
+link. What a protocol has of its own are three scripts (`_greet`, `_begin`, `_end`), a decoder and `_take`, which makes
+profiles of what the stream brings. The scripts run in `talk.py`, the account is kept by `profile_account.py`.
 """
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import ScannerError, ScannerNotConnected, ScannerRefused
-from drivers.protocols.dialogue import Dialogue, Script
-from drivers.protocols.framing import Damage, DamageReason
+from drivers.protocols.dialogue import Script
+from drivers.protocols.framing import Damage
+from drivers.protocols.profile_account import ProfileAccount
 from drivers.protocols.scanner_events import (
     Advice,
     ClockJumped,
@@ -26,11 +27,9 @@ from drivers.protocols.scanner_events import (
     Reconnected,
     ScannerEvent,
 )
+from drivers.protocols.talk import Decoder, Talk
 from drivers.scanline import BoolArray, DeviceInfo, Float64Array, Profile
-from drivers.tally import BootLedger, Kind, Tally
-
-_U32 = 1 << 32
-_MAX_SKIP = 1 << 30  # a gap that is said to be longer is no gap but nonsense
+from drivers.tally import Tally
 
 
 class Phase(Enum):
@@ -51,13 +50,14 @@ class Task:
     failure: ScannerError | None = None
 
 
-class Conversation(ABC):
+class Conversation(Talk):
     """One conversation with one device, over as many links as it takes.
 
     Parameters
     ----------
     deliver : takes a profile; False when it could not, which is counted as `host_overflow`.
     emit : takes an event.
+    decoder : understands the device's bytes.
     boot_id : names this conversation in the record; the devices of these protocols have no number for their boots.
     rates : baud rates to try, the likeliest first.
     """
@@ -65,40 +65,26 @@ class Conversation(ABC):
     silent_after_s = 2.0
     """A stream without a profile for so long has stopped: the link is then opened anew."""
 
-    break_after_s: float | None = None
-    """A pause inside a frame after which its rest will not come; None where a frame says itself where it ends."""
-
     def __init__(
         self,
         deliver: Callable[[Profile], bool],
         emit: Callable[[ScannerEvent], None],
+        decoder: Decoder,
         *,
         boot_id: int,
         rates: tuple[int, ...],
     ) -> None:
-        if not rates or min(rates) <= 0:
-            raise ValueError(f"baud rates must be greater than 0, not {rates}")
-        self.outgoing = bytearray()
-        self.baud_rate = rates[0]
-        """What the port is to be set to now."""
-        self.dtr: bool | None = None
-        """How DTR is to stand now; None leaves it."""
+        super().__init__(decoder, lambda text: emit(Advice(text)), rates)
         self.info: DeviceInfo | None = None
         self.phase = Phase.CLOSED
         self.failure: ScannerError | None = None
         """Why nobody was met on this link."""
         self.laser_on: bool | None = None
-        self.heard_bytes = 0
-        self._heard_s = 0.0
         self.boot_id = boot_id
-        self.pass_index = 0
-        self._rates = rates
         self._deliver = deliver
         self._emit = emit
-        self._dialogue: Dialogue | None = None
         self._task: Task | None = None
-        self._ledger = BootLedger()
-        self._next_line = 0
+        self._account = ProfileAccount(boot_id)
         self._told_jumps = 0
         self._streaming = False
         self._wanted = False
@@ -106,23 +92,9 @@ class Conversation(ABC):
         self._other_id = ""
         self._lost_s: float | None = None
         self._profile_s = 0.0
-        self._timed_s = 0.0
-        self._timed_pass = 0
         self._in_trouble: str | None = None
 
     # ---- what a protocol brings -----------------------------------------------------------------------------------
-
-    @abstractmethod
-    def _decode(self, data: bytes, now_s: float) -> list[Any]:
-        """Items and Damage that these bytes complete."""
-
-    @abstractmethod
-    def _reset_decoder(self) -> list[Damage]:
-        """Forget what has begun; return it as damage."""
-
-    def _break_off(self) -> list[Any]:
-        """What can be understood when the rest of the frame under way will not come; the decoder may keep nothing."""
-        return []
 
     @abstractmethod
     def _greet(self) -> Script[DeviceInfo]:
@@ -140,11 +112,8 @@ class Conversation(ABC):
     def _take(self, item: Any, now_s: float) -> None:
         """Take an item of the stream that no script waited for."""
 
-    def _close_line(self, now_s: float) -> None:  # noqa: B027 - only some protocols collect a profile from pieces
+    def _close_line(self, now_s: float) -> None:
         """Hand on the profile that is being collected, if there is one."""
-
-    def _poll(self, now_s: float) -> None:  # noqa: B027 - only some protocols have to ask again and again
-        """Do what is due by now."""
 
     # ---- the link -------------------------------------------------------------------------------------------------
 
@@ -162,7 +131,7 @@ class Conversation(ABC):
         for damage in self._reset_decoder():
             self._damage(damage)
         self._close_line(now_s)
-        self._ledger.link_lost()
+        self._account.link_lost()
         self._fail_task(ScannerNotConnected(reason))
         self._streaming = False
         self.laser_on = None
@@ -174,7 +143,7 @@ class Conversation(ABC):
         self._emit(Disconnected(reason, now_s))
         if self._wanted and not self._resume:
             self._wanted = False
-            self._emit(PassEnded(self.pass_index, "disconnected"))
+            self._pass_ended("disconnected")
             self._emit(PassNotResumed("the link was lost, and this pass was not to go on by itself"))
 
     def end(self) -> None:
@@ -184,6 +153,11 @@ class Conversation(ABC):
         self._wanted = self._streaming = False
         self.laser_on = None
         self.phase = Phase.CLOSED
+
+    @property
+    def pass_index(self) -> int:
+        """The pass that runs, or ran last; 0 before the first."""
+        return self._account.pass_index
 
     @property
     def is_met(self) -> bool:
@@ -202,25 +176,6 @@ class Conversation(ABC):
             return f"no profile has come for {self.silent_after_s:g} s; check the scanner's power and its cable"
         return None
 
-    def receive(self, data: bytes, now_s: float) -> None:
-        """Take bytes from the device."""
-        if not data:
-            return
-        self.heard_bytes += len(data)
-        if self._dialogue is not None:
-            self._dialogue.heard(now_s)
-        self._heard_s = now_s
-        self._hear(self._decode(data, now_s), now_s)
-
-    def tick(self, now_s: float) -> None:
-        """Do what is due by now."""
-        if self.break_after_s is not None and now_s - self._heard_s > self.break_after_s:
-            self._hear(self._break_off(), now_s)
-        if self._dialogue is not None:
-            self._dialogue.tick(now_s)
-        if self.phase is not Phase.CLOSED:
-            self._poll(now_s)
-
     # ---- commands -------------------------------------------------------------------------------------------------
 
     def start(self, now_s: float, *, resume: bool) -> Task:
@@ -232,7 +187,7 @@ class Conversation(ABC):
             task.done, task.failure = True, ScannerRefused("the scanner is measuring already; stop it first")
             self._task = None
             return task
-        self.pass_index += 1
+        self._account.begin_pass()
         self._wanted, self._resume = True, resume
         self._streaming = True
         self._profile_s = now_s
@@ -249,7 +204,7 @@ class Conversation(ABC):
         """End the stream; it will not go on by itself, whatever happens."""
         was_wanted, self._wanted = self._wanted, False
         if was_wanted and self.phase is not Phase.UP:
-            self._emit(PassEnded(self.pass_index, "stopped"))
+            self._pass_ended("stopped")
         if self._task is not None:
             self._fail_task(ScannerRefused("the scanner was stopped meanwhile"))
         task = self._new_task()
@@ -269,30 +224,18 @@ class Conversation(ABC):
 
     def tally(self) -> Tally:
         """The accounts so far."""
-        return self._ledger.tally()
+        return self._account.tally()
 
     # ---- for the protocols ----------------------------------------------------------------------------------------
-
-    def _say(self, data: bytes) -> None:
-        self.outgoing += data
-
-    def _advise(self, text: str) -> None:
-        self._emit(Advice(text))
 
     def _damage(self, damage: Damage) -> None:
         """Enter damage, once there is a device whose account it can be."""
         if self.info is not None:
-            self._ledger.damage(damage.reason.value, damage.n_bytes)
+            self._account.damage(damage)
 
-    def _lost_lines(self, n_lines: int) -> None:
-        """Profiles that the device made and that did not arrive; their reason is what happened on the wire."""
-        self._next_line += min(max(n_lines, 0), _MAX_SKIP)
-
-    def _lost_by_time(self, device_time_s: float, period_s: float) -> None:
-        """Enter the profiles that are missing before one of `device_time_s`, of a scanner that makes one a period."""
-        if self._timed_pass == self.pass_index:
-            self._lost_lines(round((device_time_s - self._timed_s) / period_s) - 1)
-        self._timed_s, self._timed_pass = device_time_s, self.pass_index
+    def _unasked(self, item: Any, now_s: float) -> None:
+        if self._streaming:
+            self._take(item, now_s)
 
     def _fault(self, text: str) -> None:
         """The device itself has stopped measuring; `text` is one sentence."""
@@ -300,13 +243,7 @@ class Conversation(ABC):
         self._streaming = False
         if self._wanted:
             self._wanted = False
-            self._emit(PassEnded(self.pass_index, "fault"))
-
-    def _enter_line(self, dropped_lines: int = 0) -> bool:
-        """Enter the next profile into the account; `dropped_lines` of those lost so far the device dropped itself."""
-        number, dropped = self._next_line % _U32, dropped_lines % _U32
-        self._next_line += 1
-        return self._ledger.chunk(number, number, dropped, dropped).kind is Kind.NEW
+            self._pass_ended("fault")
 
     def _jumped(self, jumps: int) -> None:
         """Tell of jumps of the device's clock, `jumps` of them so far."""
@@ -330,7 +267,7 @@ class Conversation(ABC):
             device_id=self.info.device_id,
             boot_id=self.boot_id,
             pass_index=self.pass_index,
-            line_index=self._next_line - 1,
+            line_index=self._account.latest_line,
             device_time_s=device_time_s,
             arrival_s=now_s,
             x_mm=x_mm,
@@ -342,44 +279,11 @@ class Conversation(ABC):
             step_mm=float(np.nan),
         )
         if self._deliver(profile):
-            self._ledger.line_closed(whole=profile.is_whole)
-            self._ledger.no_return(no_return)
+            self._account.handed_on(no_return, whole=profile.is_whole)
         else:
-            self._ledger.line_not_kept("host_overflow", 1)
-
-    def _hear(self, items: list[Any], now_s: float) -> None:
-        for item in items:
-            if isinstance(item, Damage):
-                self._damage(item)
-            elif not (self._dialogue is not None and self._dialogue.offer(item, now_s)) and self._streaming:
-                self._take(item, now_s)
+            self._account.not_taken()
 
     # ---- inside ---------------------------------------------------------------------------------------------------
-
-    def _run(
-        self,
-        script: Script[Any],
-        now_s: float,
-        done: Callable[[Any, float], None],
-        failed: Callable[[ScannerError, float], None],
-    ) -> None:
-        self._abandon_dialogue()
-
-        def is_done(result: object, at_s: float) -> None:
-            self._dialogue = None
-            done(result, at_s)
-
-        def has_failed(error: ScannerError, at_s: float) -> None:
-            self._dialogue = None
-            failed(error, at_s)
-
-        self._dialogue = dialogue = Dialogue(script, now_s, is_done, has_failed)
-        dialogue.begin(now_s)
-
-    def _abandon_dialogue(self) -> None:
-        dialogue, self._dialogue = self._dialogue, None
-        if dialogue is not None:
-            dialogue.abandon()
 
     def _new_task(self) -> Task:
         self._task = Task()
@@ -406,7 +310,11 @@ class Conversation(ABC):
         self._close_line(now_s)
         self._streaming = False
         if was_wanted:
-            self._emit(PassEnded(self.pass_index, reason))
+            self._pass_ended(reason)
+
+    def _pass_ended(self, reason: str) -> None:
+        self._account.end_pass()
+        self._emit(PassEnded(self.pass_index, reason))
 
     def _met(self, info: DeviceInfo, now_s: float) -> None:
         if self.info is not None and info.device_id != self.info.device_id:
@@ -442,6 +350,3 @@ class Conversation(ABC):
     def _unmet(self, error: ScannerError, _now_s: float) -> None:
         self.failure = error
         self.phase = Phase.UNMET
-
-    def _cut_off(self, n_bytes: int) -> list[Damage]:
-        return [Damage(DamageReason.CUT_OFF, n_bytes)] if n_bytes else []

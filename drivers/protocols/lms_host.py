@@ -4,7 +4,7 @@ Nothing is written to the scanner's EEPROM: mode, rate and variant hold until it
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,9 +91,9 @@ class LmsHost(Conversation):
         rates: tuple[int, ...] = RATES,
         options: LmsOptions | None = None,
     ) -> None:
-        super().__init__(deliver, emit, boot_id=boot_id, rates=rates)
+        self._frames = TelegramDecoder()
+        super().__init__(deliver, emit, self._frames, boot_id=boot_id, rates=rates)
         self._options = options or LmsOptions()
-        self._decoder = TelegramDecoder()
         self._status: ScannerStatus | None = None
         self._measuring_mode = 0
         self._scan_s = TURN_S
@@ -103,32 +103,13 @@ class LmsHost(Conversation):
         self._dropped_lines = 0
         self._told_status = 0
 
-    def _decode(self, data: bytes, now_s: float) -> list[Any]:
-        return list(self._decoder.receive(data))
-
-    def _break_off(self) -> list[Any]:
-        return list(self._decoder.break_off())
-
-    def _reset_decoder(self) -> list[Damage]:
-        return self._cut_off(self._decoder.reset())
+    def _break_off(self) -> Sequence[Any]:
+        return self._frames.break_off()
 
     # ---- scripts --------------------------------------------------------------------------------------------------
 
     def _greet(self) -> Script[DeviceInfo]:
-        before = self.heard_bytes
-        for rate in dict.fromkeys((self.baud_rate, *self._rates)):
-            self.baud_rate = rate
-            if (yield from self._quieten()):
-                break
-        else:
-            tried = ", ".join(map(str, dict.fromkeys(self._rates)))
-            if self.heard_bytes > before:
-                raise ScannerSilent(
-                    f"what comes at {tried} baud is not an LMS2xx's; check the cable (RS-232 or RS-422)"
-                )
-            raise ScannerSilent(
-                f"no LMS2xx answers at {tried} baud; check its power (24 V; it wakes up for 60 s) and cable"
-            )
+        yield from self._find_rate(self._quieten)
         yield from self._switch_rate()
         kind = yield from self._request(telegram(0, Command.TYPE), Command.TYPE)
         if self._options.variant is not None:
@@ -159,6 +140,11 @@ class LmsHost(Conversation):
             points_per_line=status.angle_deg * 100 // status.resolution_hundredths + 1,
             geometry=SensorGeometry(np.zeros(3), np.zeros(3), (-8191.0 * UNITS_MM.get(status.unit, 10.0), 0.0), 0.0),
         )
+
+    def _nobody(self, tried: str, *, heard: bool) -> str:
+        if heard:
+            return f"what comes at {tried} baud is not an LMS2xx's; check the cable (RS-232 or RS-422)"
+        return f"no LMS2xx answers at {tried} baud; check its power (24 V; it wakes up for 60 s) and cable"
 
     def _quieten(self) -> Script[bool]:
         """Let it send on request only; True when a scanner did so at this rate."""
@@ -216,14 +202,7 @@ class LmsHost(Conversation):
         if answer is None or answer.data[:1] != b"\0":
             self._advise(f"the scanner stays at {old} baud: it did not agree to {new}")
             return
-        for rate in (new, old):
-            self.baud_rate = rate
-            yield Pause(0.05)
-            if (yield from self._quieten()):
-                if rate == old:
-                    self._advise(f"the scanner agreed to {new} baud and cannot be understood there; it stays at {old}")
-                return
-        raise ScannerTimeout(f"the scanner went to {new} baud and does not answer any more; switch it off and on")
+        yield from self._settle_at(new, old, self._quieten)
 
     def _switch_variant(self, angle_deg: int, resolution: int) -> Script[None]:
         answer = yield from self._request(variant_request(angle_deg, resolution), Command.VARIANT, within_s=_MODE_S)
@@ -268,7 +247,7 @@ class LmsHost(Conversation):
             return
         self._watch_status(item.status or 0)
         device_time_s = self._number(values, now_s)
-        if not self._enter_line(self._dropped_lines):
+        if not self._account.enter(self._dropped_lines):
             return
         assert self._status is not None
         range_mm, reasons = distances_of(values, self._measuring_mode)
@@ -301,7 +280,7 @@ class LmsHost(Conversation):
             telegrams = (values.telegram_index - self._last[1]) % _INDEX_SPAN or _INDEX_SPAN
             if scans < _INDEX_SPAN:  # beyond that the telegram index has come round
                 self._dropped_lines += max(0, scans - min(telegrams, scans))
-            self._lost_lines(scans - 1)
+            self._account.lost(scans - 1)
         self._last, self._last_pass = (scan, values.telegram_index), self.pass_index
         return device_time_s
 

@@ -3,13 +3,13 @@
 RS-485 has one pair of wires: never is more than one request under way, and an adapter that hears itself is noticed.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from drivers.errors import ScannerRefused, ScannerSilent, ScannerTimeout
+from drivers.errors import ScannerRefused, ScannerTimeout
 from drivers.protocols.conversation import Conversation
 from drivers.protocols.device_clock import DeviceClock
 from drivers.protocols.dialogue import Answer, Quiet, Script
@@ -79,42 +79,21 @@ class Ls100Host(Conversation):
         rates: tuple[int, ...] = RATES,
         options: Ls100Options | None = None,
     ) -> None:
-        super().__init__(deliver, emit, boot_id=boot_id, rates=rates)
+        self._frames = FrameDecoder()
+        super().__init__(deliver, emit, self._frames, boot_id=boot_id, rates=rates)
         self._options = options or Ls100Options()
-        self._decoder = FrameDecoder()
         self._address = 0
         self._n_points = 0
         self._clock = DeviceClock(TIME_SPAN, TIME_TICK_S)
         self._has_echo = False
 
-    def _decode(self, data: bytes, now_s: float) -> list[Any]:
-        return list(self._decoder.receive(data))
-
-    def _break_off(self) -> list[Any]:
-        return list(self._decoder.break_off())
-
-    def _reset_decoder(self) -> list[Damage]:
-        return self._cut_off(self._decoder.reset())
+    def _break_off(self) -> Sequence[Any]:
+        return self._frames.break_off()
 
     # ---- scripts --------------------------------------------------------------------------------------------------
 
     def _greet(self) -> Script[DeviceInfo]:
-        before = self.heard_bytes
-        for rate in dict.fromkeys((self.baud_rate, *self._rates)):
-            self.baud_rate = rate
-            yield Quiet(0.02, 0.5)  # the rest of a reply that an earlier program asked for
-            self._decoder.reset()
-            reply = yield from self._ask(frame(PROFILE_ADDRESS), tries=2)
-            if reply is not None:
-                break
-        else:
-            tried = ", ".join(map(str, dict.fromkeys(self._rates)))
-            if self.heard_bytes > before:
-                raise ScannerSilent(
-                    f"what comes at {tried} baud is no reply of a Profiler 2 or LS-100"
-                    + ("; the adapter repeats what is sent, but nobody answers" if self._has_echo else "")
-                )
-            raise ScannerSilent(f"no Profiler 2 or LS-100 answers at {tried} baud; check its power and swap A with B")
+        reply = yield from self._find_rate(self._ask_address)
         if len(reply.data) != 4:
             raise ScannerRefused(f"the sensor told its profile's address in {len(reply.data)} bytes instead of 4")
         self._address = int.from_bytes(reply.data, "big")
@@ -133,6 +112,17 @@ class Ls100Host(Conversation):
                 np.array(self._options.laser_mm), np.array(self._options.laser_mm), (-_REACH_MM, _REACH_MM), 0.0
             ),
         )
+
+    def _nobody(self, tried: str, *, heard: bool) -> str:
+        if not heard:
+            return f"no Profiler 2 or LS-100 answers at {tried} baud; check its power and swap A with B"
+        echo = "; the adapter repeats what is sent, but nobody answers" if self._has_echo else ""
+        return f"what comes at {tried} baud is no reply of a Profiler 2 or LS-100{echo}"
+
+    def _ask_address(self) -> Script[Frame | None]:
+        yield Quiet(0.02, 0.5)  # the rest of a reply that an earlier program asked for
+        self._decoder.reset()
+        return (yield from self._ask(frame(PROFILE_ADDRESS), tries=2))
 
     def _ask(self, request: bytes, tries: int = _TRIES) -> Script[Frame | None]:
         """Ask, and again after damage or silence; None when no reply comes.
@@ -225,12 +215,12 @@ class Ls100Host(Conversation):
         missing = state == 2.0
         if missing.all():
             self._not_read(ScannerTimeout("no part of the profile could be read"), now_s)
-        elif self._enter_line():
+        elif self._account.enter():
             self._profile(x_mm, z_mm, missing, device_time_s, now_s, {"no_measurement": int((state == 1.0).sum())})
 
     def _not_read(self, _error: Any, now_s: float) -> None:
         """A profile that was asked for and did not come; when none comes for long the link is opened anew."""
-        self._lost_lines(1)
+        self._account.lost(1)
         if now_s - self._profile_s > self.silent_after_s:
             self._in_trouble = (
                 f"no profile has come for {self.silent_after_s:.2g} s; check the sensor's power and its cable"

@@ -57,6 +57,7 @@ class MarlinHost(StageHost):
         self._waiting: deque[str] = deque()
         self._under_way: str | None = None
         self._swallow_ok = False
+        self._complaint = ""  # an error that no answer has followed yet
         self._asked_s = self._answer_due_s = self._next_poll_s = 0.0
         self._position: Position | None = None
         self._draining = False
@@ -122,7 +123,9 @@ class MarlinHost(StageHost):
         match parse(line):
             case Started():
                 self._restarted_by_itself(now_s)
-            case Done():
+            case Done(text=text):
+                if isinstance(told := parse(text), Position):  # some firmwares answer M114 on the line of its `ok`
+                    self._positioned(told, now_s)
                 self._acknowledged(now_s)
             case Busy():
                 self._answer_due_s = now_s + _ANSWER_S
@@ -157,12 +160,13 @@ class MarlinHost(StageHost):
         if is_halt:
             self._lose_position(f"the controller has halted: {text}", now_s)
             self._fail(StageAlarm(f"the controller has halted: {text}; switch it off and on, then home"))
-        elif not any(word in text.lower() for word in ("checksum", "line number")):  # those ask for a line again
-            self._fail(StageRefused(f"the controller reports: {text}"))
+        else:  # whether it asks for the line again, or has refused it, the next answer tells
+            self._complaint = text
 
     def _send_again(self, number: int, now_s: float) -> None:
         lines = self._sent.again(number)
         self._swallow_ok = True
+        self._complaint = ""
         if lines is None:  # of another numbering: begin anew
             if self.phase is Phase.GREETING:
                 self._draining = True
@@ -176,6 +180,9 @@ class MarlinHost(StageHost):
             self._carried_out(now_s)
 
     def _acknowledged(self, now_s: float) -> None:
+        complaint, self._complaint = self._complaint, ""
+        if complaint:
+            self._fail(StageRefused(f"the controller reports: {complaint}"))
         if self._swallow_ok:
             self._swallow_ok = False
         elif self._under_way is None:
@@ -293,6 +300,7 @@ class MarlinHost(StageHost):
     def _repeat(self, now_s: float) -> None:
         """Say the last line again: if it had arrived, the controller asks for the one behind it."""
         self._answer_due_s = now_s + _ANSWER_S
+        self._complaint = ""  # no answer came behind it: the line is said again
         if self._under_way == "M410":
             self.outbox.put(b"M410\n")
         elif self._under_way == "M110":

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.errors import ScannerRefused, ScannerSilent, ScannerTimeout
+from drivers.errors import ScannerRefused, ScannerTimeout
 from drivers.protocols.conversation import Conversation
 from drivers.protocols.device_clock import DeviceClock
 from drivers.protocols.dialogue import Answer as Awaited
@@ -105,9 +105,9 @@ class RplidarHost(Conversation):
         rates: tuple[int, ...] = RATES,
         options: RplidarOptions | None = None,
     ) -> None:
-        super().__init__(deliver, emit, boot_id=boot_id, rates=rates)
         self._options = options or RplidarOptions()
-        self._decoder = AnswerDecoder(signed_offsets=self._options.signed_offsets)
+        self._answers = AnswerDecoder(signed_offsets=self._options.signed_offsets)
+        super().__init__(deliver, emit, self._answers, boot_id=boot_id, rates=rates)
         self._turns = TurnCollector()
         self._mode: Mode | None = None
         self._has_pwm = False
@@ -117,36 +117,23 @@ class RplidarHost(Conversation):
         self.dtr = True  # the motor rests
 
     def _decode(self, data: bytes, now_s: float) -> list[Any]:
-        found = self._decoder.receive(data)
+        found = self._answers.receive(data)
         if self._streaming:
             for item in found:
                 if isinstance(item, Damage):
                     self._turns.lost_bytes(item.n_bytes)
                 elif isinstance(item, Sample | Capsule) and self._dialogue is None:
                     self._collect(item, now_s)
-            return [item for item in found if not isinstance(item, Sample | Capsule)]
         return [item for item in found if not isinstance(item, Sample | Capsule)]
 
     def _reset_decoder(self) -> list[Damage]:
         self._turns.forget()
-        return self._cut_off(self._decoder.reset())
+        return super()._reset_decoder()
 
     # ---- scripts --------------------------------------------------------------------------------------------------
 
     def _greet(self) -> Script[DeviceInfo]:
-        before = self.heard_bytes
-        for rate in dict.fromkeys((self.baud_rate, *self._rates)):
-            self.baud_rate = rate
-            info = yield from self._identify()
-            if info is not None:
-                break
-        else:
-            tried = ", ".join(map(str, dict.fromkeys(self._rates)))
-            if self.heard_bytes > before:
-                raise ScannerSilent(
-                    f"what comes at {tried} baud is not an RPLIDAR's; check the model's rate and the cable"
-                )
-            raise ScannerSilent(f"no RPLIDAR answers at {tried} baud; check its power (a weak USB port is not enough)")
+        info = yield from self._find_rate(self._identify)
         model, minor, major, hardware = info[:4]
         self._has_pwm = model >> 4 in (2, 3)
         yield from self._check_health()
@@ -163,6 +150,11 @@ class RplidarHost(Conversation):
             points_per_line=max(1, round(1e6 / mode.us_per_sample / _USUAL_TURN_HZ)),
             geometry=SensorGeometry(np.zeros(3), np.zeros(3), (-mode.max_mm, 0.0), 0.0),
         )
+
+    def _nobody(self, tried: str, *, heard: bool) -> str:
+        if heard:
+            return f"what comes at {tried} baud is not an RPLIDAR's; check the model's rate and the cable"
+        return f"no RPLIDAR answers at {tried} baud; check its power (a weak USB port is not enough)"
 
     def _identify(self) -> Script[bytes | None]:
         """Stop whatever runs, and ask who is there at this rate."""
@@ -182,7 +174,7 @@ class RplidarHost(Conversation):
         return None if packet is None else packet.data
 
     def _ask(self, question: bytes, kind: int = _NOTHING) -> None:
-        self._decoder.expect(kind)
+        self._answers.expect(kind)
         self._say(question)
 
     def _health(self) -> Script[tuple[int, int] | None]:
@@ -319,11 +311,11 @@ class RplidarHost(Conversation):
         us = self._mode.us_per_sample
         device_time_s = self._clock.read(round(turn.first_sample * us), now_s)
         self._jumped(self._clock.jumps)
-        self._lost_by_time(device_time_s, self._turn_s)
+        self._account.lost_by_time(device_time_s, self._turn_s)
         if not turn.missing.any():
             self._turn_s = len(turn.angle_rad) * us * 1e-6
             self.silent_after_s = max(2.0, 5 * self._turn_s)
-        if not self._enter_line():
+        if not self._account.enter():
             return
         angle_rad, range_mm, missing = turn.angle_rad, turn.range_mm.copy(), turn.missing
         if self._options.field_of_view_rad is not None:

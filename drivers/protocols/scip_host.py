@@ -13,7 +13,7 @@ import numpy as np
 from drivers.errors import ScannerRefused, ScannerSilent, ScannerTimeout
 from drivers.protocols.conversation import Conversation
 from drivers.protocols.device_clock import DeviceClock
-from drivers.protocols.dialogue import Answer, Pause, Quiet, Script
+from drivers.protocols.dialogue import Answer, Quiet, Script
 from drivers.protocols.framing import Damage, DamageReason
 from drivers.protocols.polar import reasons_of, sensor_from_polar
 from drivers.protocols.scanner_events import ScannerEvent
@@ -135,33 +135,17 @@ class ScipHost(Conversation):
         rates: tuple[int, ...] = RATES,
         options: ScipOptions | None = None,
     ) -> None:
-        super().__init__(deliver, emit, boot_id=boot_id, rates=rates)
+        super().__init__(deliver, emit, ReplyDecoder(), boot_id=boot_id, rates=rates)
         self._options = options or ScipOptions()
-        self._decoder = ReplyDecoder()
         self._parameters: Parameters | None = None
         self._request: _Request | None = None
         self._angles_rad = np.empty(0)
         self._clock = DeviceClock(CLOCK_SPAN, CLOCK_TICK_S)
 
-    def _decode(self, data: bytes, now_s: float) -> list[Any]:
-        return list(self._decoder.receive(data))
-
-    def _reset_decoder(self) -> list[Damage]:
-        return self._cut_off(self._decoder.reset())
-
     # ---- scripts --------------------------------------------------------------------------------------------------
 
     def _greet(self) -> Script[DeviceInfo]:
-        before = self.heard_bytes
-        for rate in dict.fromkeys((self.baud_rate, *self._rates)):
-            self.baud_rate = rate
-            if (yield from self._quieten()):
-                break
-        else:
-            tried = ", ".join(map(str, dict.fromkeys(self._rates)))
-            if self.heard_bytes > before:
-                raise ScannerSilent(f"what comes at {tried} baud is not SCIP 2.0; is this a Hokuyo lidar?")
-            raise ScannerSilent(f"no Hokuyo lidar answers at {tried} baud; check its power and the cable")
+        yield from self._find_rate(self._quieten)
         version = yield from self._information("VV")
         parameters = _parameters((yield from self._information("PP")))
         yield from self._switch_rate()
@@ -180,6 +164,11 @@ class ScipHost(Conversation):
             points_per_line=self._plan(parameters).n_values,
             geometry=SensorGeometry(np.zeros(3), np.zeros(3), reach_mm, 0.0),
         )
+
+    def _nobody(self, tried: str, *, heard: bool) -> str:
+        if heard:
+            return f"what comes at {tried} baud is not SCIP 2.0; is this a Hokuyo lidar?"
+        return f"no Hokuyo lidar answers at {tried} baud; check its power and the cable"
 
     def _quieten(self) -> Script[bool]:
         """Stop whatever runs; True when a sensor answered at this rate, and all it had to say is read."""
@@ -235,15 +224,7 @@ class ScipHost(Conversation):
             why = "did not answer" if answer is None else f"said {answer.status}"
             self._advise(f"the lidar stays at {old} baud: asked for {new} it {why}")
             return
-        self.baud_rate = new
-        yield Pause(0.05)
-        for rate in (new, old):
-            self.baud_rate = rate
-            if (yield from self._quieten()):
-                if rate == old:
-                    self._advise(f"the lidar agreed to {new} baud and cannot be understood there; it stays at {old}")
-                return
-        raise ScannerTimeout(f"the lidar went to {new} baud and does not answer any more; switch it off and on")
+        yield from self._settle_at(new, old, self._quieten)
 
     def _begin(self) -> Script[None]:
         assert self._parameters is not None
@@ -298,8 +279,8 @@ class ScipHost(Conversation):
             return
         device_time_s = self._clock.read(scan.timestamp, now_s)
         self._jumped(self._clock.jumps)
-        self._lost_by_time(device_time_s, self._period_s(request, parameters))
-        if not self._enter_line():
+        self._account.lost_by_time(device_time_s, self._period_s(request, parameters))
+        if not self._account.enter():
             return
         if scan.damaged_bytes:
             self._damage(Damage(DamageReason.BAD_SUM, scan.damaged_bytes))

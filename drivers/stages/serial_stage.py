@@ -1,7 +1,7 @@
-"""A stage on a serial port, whatever its protocol: the port, its thread, soft limits, and waiting; knows no protocol.
+"""A stage on a serial port, whatever its protocol: soft limits, refusals, and waiting; knows no protocol.
 
-The conversation is a `StageHost`, which knows no port; here are the thread that reads and writes for it, the unit of
-travel, and the refusals that need no controller.
+The conversation is a `StageHost`, port and thread are `stage_link.py`, positions `whereabouts.py`; here are the soft
+limits, and the refusals that need no controller.
 """
 
 import math
@@ -14,8 +14,6 @@ from typing import Self, TypeAlias
 
 from drivers.errors import (
     DriverError,
-    PortError,
-    PortStalled,
     StageLimit,
     StageNotConnected,
     StagePositionUnknown,
@@ -23,30 +21,20 @@ from drivers.errors import (
     StageSilent,
     StageTimeout,
 )
-from drivers.port import ModemLines, Port, lasting_path
-from drivers.port_names import find_port
-from drivers.protocols.stage_events import (
-    Reading,
-    StageDisconnected,
-    StageEvent,
-    StageReconnected,
-)
+from drivers.port import ModemLines
+from drivers.protocols.stage_events import Reading, StageDisconnected, StageEvent, StageReconnected
 from drivers.protocols.stage_host import Errand, Phase, StageHost
 from drivers.rig_limits import Interval
 from drivers.stages.face import StageInfo, StageReading
+from drivers.stages.stage_link import StageLink
+from drivers.stages.whereabouts import Whereabouts
 
 HostMaker: TypeAlias = Callable[[Callable[[Reading], None], Callable[[StageEvent], None]], StageHost]
 
 _AS_IT_IS = ModemLines()
-_READ_S = 0.02
-_REOPEN_S = 0.1
-_STALL_S = 1.0
 _EXIT_S = 3.0
-_MAX_READINGS = 10_000
 _MAX_EVENTS = 1_000
 _SLACK_MM = 1e-6
-_ASTRAY_MM = 0.1
-"""How far from where it may be a stage that was out of sight can stand before its position is called lost."""
 
 
 class SerialStage:
@@ -84,18 +72,12 @@ class SerialStage:
         self._lines = lines
         self._clock = clock
         self._patience_s = patience_s
-        self._opens = port_name
-        self._changed = threading.Condition()  # guards everything below except the port, which is the thread's
+        self._changed = threading.Condition()  # guards everything below
         self._host = makes_host(self._take_reading, self._take_event)
-        self._zero_mm = 0.0  # position of the stage where the controller says 0
-        self._readings: deque[StageReading] = deque(maxlen=_MAX_READINGS)
+        self._where = Whereabouts(mm_per_unit)
         self._events: deque[StageEvent] = deque(maxlen=_MAX_EVENTS)
-        self._latest: StageReading | None = None
-        self._expected_mm: Interval | None = None  # where a stage that is back must be, if nobody moved it
         self._identity = ""
-        self._failure: Exception | None = None
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._link: StageLink | None = None
 
     def __enter__(self) -> Self:
         self.enter()
@@ -117,21 +99,16 @@ class SerialStage:
         StageSilent : when nothing intelligible answers.
         StageRefused : when the controller cannot be driven; the message says what to set.
         """
-        if self._thread is not None:
+        if self._link is not None:
             raise DriverError(f"{self._port_name} has been entered already; exit first")
-        path = find_port(self._port_name)
-        self._opens = self._port_name if self._port_name.startswith("usb:") else lasting_path(path)
-        port = Port(path, self._baud_rate, self._lines)
-        self._closing.clear()
-        self._failure = None
         self._host = self._makes_host(self._take_reading, self._take_event)
-        self._host.link_opened(self._clock())
-        self._thread = threading.Thread(target=self._run, args=(port,), name=f"stage {self._port_name}", daemon=True)
-        self._thread.start()
+        self._link = StageLink(
+            self._port_name, self._baud_rate, self._lines, self._host, self._changed, self._clock, self._lost
+        )
         with self._changed:
             self._changed.wait_for(
                 lambda: (
-                    (self._host.phase is Phase.UP and self._latest is not None)
+                    (self._host.phase is Phase.UP and self._where.latest is not None)
                     or self._host.refusal is not None
                     or self._failure is not None
                 ),
@@ -146,18 +123,17 @@ class SerialStage:
 
     def exit(self) -> None:
         """Stop a motion under way, close the port; never raises, and returns within about 4 s."""
-        thread = self._thread
-        if thread is None:
+        link = self._link
+        if link is None:
             return
         with self._changed:
             if self._host.phase is Phase.UP and self._host.is_busy and self._failure is None:
                 errand = self._host.stop(self._clock())
                 self._changed.wait_for(lambda: errand.is_over or self._failure is not None, _EXIT_S)
-        self._closing.set()
-        thread.join()
-        self._thread = None
-        self._latest = None
+        link.close()
         with self._changed:  # whoever still waits, in another thread, waits for nobody
+            self._link = None
+            self._where.latest = None
             self._host.link_lost("the port was closed", self._clock())
             self._changed.notify_all()
 
@@ -179,14 +155,13 @@ class SerialStage:
     def position_mm(self) -> float:
         """The latest reading; NaN while the position is unknown."""
         with self._changed:
-            return self._latest.position_mm if self._latest is not None and self._host.position_known else math.nan
+            latest = self._where.latest
+            return latest.position_mm if latest is not None and self._host.position_known else math.nan
 
     def readings(self) -> list[StageReading]:
         """Return the readings since the last call, in order; the latest 10,000 are kept."""
         with self._changed:
-            taken = list(self._readings)
-            self._readings.clear()
-        return taken
+            return self._where.take()
 
     def stage_events(self) -> list[StageEvent]:
         """Return what happened since the last call, in order; the latest 1,000 are kept."""
@@ -206,7 +181,7 @@ class SerialStage:
         """
         with self._changed:
             self._refuse_while_busy()
-            self._zero_mm = 0.0
+            self._where.found_reference()
             errand = self._host.home(self._clock())
         self._wait_for(errand)
         return self._fresh_reading()
@@ -225,12 +200,8 @@ class SerialStage:
             errand = self._host.unlock(self._clock())
         self._wait_for(errand)
         with self._changed:
-            latest = self._latest
-            if latest is None:
+            if not self._where.state(position_mm):
                 raise StageNotConnected(f"the stage on {self._port_name} has not said where it is; try again")
-            self._zero_mm += position_mm - latest.position_mm
-            self._latest = StageReading(position_mm, latest.asked_s, latest.arrived_s, latest.is_moving)
-            self._readings.clear()
             self._host.trust()
 
     def start_move(self, position_mm: float, speed_mm_per_s: float) -> None:
@@ -246,22 +217,20 @@ class SerialStage:
                     f"the stage does not move while its position is unknown ({self._host.why_unknown}); home it, or "
                     "state where it is"
                 )
-            self._host.move(
-                (position_mm - self._zero_mm) / self._mm_per_unit, speed_mm_per_s / self._mm_per_unit, self._clock()
-            )
+            self._host.move(self._where.units(position_mm), speed_mm_per_s / self._mm_per_unit, self._clock())
 
     def finish_move(self, timeout_s: float) -> StageReading | None:
         """Wait for the motion under way; see `DrivenStage.finish_move`."""
         with self._changed:
             errand = self._host.errand
             if errand is None:
-                return self._latest
+                return self._where.latest
             self._changed.wait_for(lambda: errand.is_over or self._failure is not None, timeout_s)
             if not errand.is_over and self._failure is None:
                 return None
         self._raise_failure(errand)
         with self._changed:
-            return self._latest
+            return self._where.latest
 
     def move_to(self, position_mm: float, speed_mm_per_s: float) -> StageReading:
         """Move, wait, and return where the stage came to rest; see `DrivenStage.move_to`."""
@@ -278,7 +247,7 @@ class SerialStage:
         StageTimeout, StageNotConnected : when the controller does not confirm; treat the stage as moving.
         """
         with self._changed:
-            if self._thread is None:
+            if self._link is None:
                 return  # left, and stopped then
             errand = self._host.stop(self._clock())
         self._wait_for(errand)
@@ -286,7 +255,7 @@ class SerialStage:
     # ---- inside -----------------------------------------------------------------------------------------------------
 
     def _refuse_while_busy(self) -> None:
-        if self._thread is None:
+        if self._link is None:
             raise StageNotConnected(f"the stage on {self._port_name} has not been entered")
         if self._host.is_busy:
             raise StageRefused("a motion is under way; wait for it or stop it first")
@@ -319,11 +288,21 @@ class SerialStage:
         now_s = self._clock()
         with self._changed:
             self._changed.wait_for(
-                lambda: (self._latest is not None and self._latest.asked_s >= now_s) or self._failure is not None, 5.0
+                lambda: (
+                    (self._where.latest is not None and self._where.latest.asked_s >= now_s)
+                    or self._failure is not None
+                ),
+                5.0,
             )
-            if self._latest is None or self._latest.asked_s < now_s:
+            latest = self._where.latest
+            if latest is None or latest.asked_s < now_s:
                 raise StageTimeout(f"the stage on {self._port_name} does not say where it is; check cable and power")
-            return self._latest
+            return latest
+
+    @property
+    def _failure(self) -> Exception | None:
+        """What ended the link's thread."""
+        return None if self._link is None else self._link.failure
 
     def _describe_silence(self, heard_bytes: int) -> str:
         where = f"{self._port_name} at {self._baud_rate} baud"
@@ -334,17 +313,12 @@ class SerialStage:
             )
         return f"no stage answers on {where}; check its power, the cable, the path and the rate"
 
-    # ---- in the thread; these are called with the lock held ---------------------------------------------------------
+    # ---- in the thread of the link; these are called with the lock held ---------------------------------------------
 
     def _take_reading(self, reading: Reading) -> None:
-        at_mm = self._zero_mm + reading.position * self._mm_per_unit
-        if self._expected_mm is not None:
-            low, high = self._expected_mm
-            self._expected_mm = None
-            if not low - _ASTRAY_MM <= at_mm <= high + _ASTRAY_MM:
-                self._host.distrust(f"it came back at {at_mm:g} mm, where it cannot have gone by itself", self._clock())
-        self._latest = StageReading(at_mm, reading.asked_s, reading.arrived_s, reading.is_moving)
-        self._readings.append(self._latest)
+        astray = self._where.read(reading)
+        if astray is not None:
+            self._host.distrust(astray, self._clock())
 
     def _take_event(self, event: StageEvent) -> None:
         if isinstance(event, StageReconnected) and self._identity not in ("", self._host.identity):
@@ -352,82 +326,12 @@ class SerialStage:
             event = StageReconnected(event.gap_s, False)
         self._events.append(event)
 
-    def _run(self, port: Port | None) -> None:
-        stalled_s: float | None = None
-        try:
-            while not self._closing.is_set():
-                try:
-                    if port is None:
-                        port = self._reopen()
-                        continue
-                    data = port.read(_READ_S)
-                    stalled_s = self._talk(port, data, stalled_s)
-                except PortError as error:
-                    if port is not None:
-                        port.close()
-                    port = None
-                    if not self._survives(error):
-                        return
-        except Exception as failure:  # noqa: BLE001 - the thread's loop: whoever waits must be told
-            with self._changed:
-                self._failure = failure
-                self._changed.notify_all()
-        finally:
-            if port is not None:
-                port.close()
-
-    def _talk(self, port: Port, data: bytes, stalled_s: float | None) -> float | None:
-        """Take what was read, send what is due; return since when the port has taken no bytes."""
-        with self._changed:
-            now_s = self._clock()
-            host = self._host
-            host.receive(data, now_s)
-            host.tick(now_s)
-            if host.is_silent():
-                raise PortStalled(port.path, f"the stage on {port.path} has fallen silent; check cable and power")
-            if len(host.outbox):
-                written = port.write(host.outbox.peek())
-                host.outbox.wrote(written)
-                if written:
-                    stalled_s = None
-                elif stalled_s is None:
-                    stalled_s = now_s
-                elif now_s - stalled_s > _STALL_S:
-                    raise PortStalled(port.path, f"{port.path} takes no more bytes; check cable and power")
-            self._changed.notify_all()
-        return stalled_s
-
-    def _survives(self, error: PortError) -> bool:
-        """Tell of a lost link; True when it is worth waiting for, False when the controller was never met."""
-        with self._changed:
-            now_s = self._clock()
-            met = bool(self._identity) or self._host.phase is Phase.UP
-            if self._host.phase is Phase.UP:
-                self._events.append(StageDisconnected(str(error), now_s))
-                self._expected_mm = self._where_it_may_go()
-            self._host.link_lost(str(error), now_s)
-            if not met:
-                self._failure = error
-            self._changed.notify_all()
+    def _lost(self, reason: str, now_s: float) -> bool:
+        """The link is gone; True when it is worth waiting for, False when the controller was never met."""
+        met = bool(self._identity) or self._host.phase is Phase.UP
+        if self._host.phase is Phase.UP:
+            self._events.append(StageDisconnected(reason, now_s))
+            errand = self._host.errand
+            self._where.lost_sight(None if errand is None or errand.is_over else errand.target)
+        self._host.link_lost(reason, now_s)
         return met
-
-    def _where_it_may_go(self) -> Interval | None:
-        """Where the stage can be when it is back: at its last reading, or on its way to the target."""
-        if self._latest is None:
-            return None
-        places = [self._latest.position_mm]
-        errand = self._host.errand
-        if errand is not None and not errand.is_over and math.isfinite(errand.target):
-            places.append(self._zero_mm + errand.target * self._mm_per_unit)
-        return (min(places), max(places))
-
-    def _reopen(self) -> Port | None:
-        """Wait a little and try the name once."""
-        self._closing.wait(_REOPEN_S)
-        try:
-            port = Port(find_port(self._opens), self._baud_rate, self._lines)
-        except PortError:
-            return None
-        with self._changed:
-            self._host.link_opened(self._clock())
-        return port

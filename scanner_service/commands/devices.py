@@ -9,6 +9,7 @@ from rich.table import Table
 
 from drivers.doctor import UDEV_RULE, Finding, Level, check_machine, check_port, check_rig
 from drivers.errors import DriverError
+from drivers.port import check_device_file
 from drivers.port_names import PortName, find_port, list_ports
 from drivers.rig_file import read_rig
 from drivers.scanners.known import identify
@@ -27,7 +28,7 @@ def devices_command(
 ) -> None:
     """List the serial ports with the names that survive a replug and, if asked, who answers on them."""
     with plain_errors():
-        ports = [PortName(find_port(name)) for name in port] if port else list_ports()
+        ports = [_named(name) for name in port] if port else list_ports()
         told = [{**asdict(item), "lasting": item.lasting, "usb_name": item.usb_name} for item in ports]
         if identify_them:
             for item, entry in zip(ports, told, strict=True):
@@ -49,6 +50,18 @@ def devices_command(
             row = [str(entry["path"]), adapter, str(entry["lasting"])]
             table.add_row(*row, *([_shown(entry["device"])] if identify_them else []))
         console.print(table)
+
+
+def _named(name: str) -> PortName:
+    """The port of that name, with its adapter where the kernel lists it; raises a PortError when there is none."""
+    path = find_port(name)
+    check_device_file(path)
+    return _known_or_bare(path)
+
+
+def _known_or_bare(path: str) -> PortName:
+    known = (port for port in list_ports() if path and path in (port.path, port.by_id, port.by_path))
+    return next(known, PortName(path))
 
 
 def who_answers(path: str) -> dict[str, Any]:
@@ -93,7 +106,7 @@ def doctor_command(
         description = read_rig(rig) if rig is not None else None
         if port:
             for name in port:
-                findings += check_port(PortName(find_port(name)))
+                findings += check_port(_known_or_bare(find_port(name)))
         elif description is None:
             findings += check_machine()
         if description is not None:

@@ -26,8 +26,9 @@ from scanner_service.storage.errors import RecordError
 from scanner_service.storage.exports.errors import ExportError
 from scanner_service.storage.formats.errors import FormatError
 
-console = Console(markup=False)  # what is told may hold brackets: paths, names, extras of a package
-errors = Console(stderr=True, markup=False)
+# What is told may hold brackets and colons: paths, names, extras of a package, usb:VID:PID.
+console = Console(markup=False, emoji=False)
+errors = Console(stderr=True, markup=False, emoji=False)
 _MADE: ContextVar[tuple[Path, ...]] = ContextVar("folders that the command has made", default=())
 EXPECTED = (
     httpx.HTTPError,

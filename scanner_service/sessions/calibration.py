@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from drivers.scanline import Float64Array, SensorGeometry
-from scanner_service.sessions.sources import DeviceSource, Source
+from scanner_service.sessions.sources import OnAWire, Source
 from scanner_service.storage.rows import EventRow
 
 
 def calibration_of(source: Source) -> dict[str, Any]:
     """Optics, mounting and identity as a JSON object; empty for a source that knows none of them."""
     kept: dict[str, Any] = {}
-    if isinstance(source, DeviceSource):
+    if isinstance(source, OnAWire):
         info = source.info
         kept["scanner"] = {
             "device_id": info.device_id,

@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -15,6 +16,8 @@ from drivers.rig_limits import PassOrder
 from drivers.running_rig import RigEvent, RigPassEnded, RunningRig
 from drivers.scanline import DeviceInfo, Float64Array, Scanline, SensorGeometry
 from drivers.stages.face import DrivenStage
+from drivers.tally import PassTally
+from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.sources import Sink, tell_scanner_event
 
 _LOG = logging.getLogger(__name__)
@@ -59,6 +62,11 @@ class RigSource:
     def tally(self) -> dict[str, Any] | None:
         """The scanner's accounts, and under `rig` what became of its profiles."""
         return self._rig.tally().to_dict() | {"rig": self._rig.report().to_dict()}
+
+    def pass_tallies(self) -> Mapping[PassKey, PassTally]:
+        """See `OnAWire`; what the rig left out is lost there, by its reason."""
+        device_id = self.info.device_id
+        return {(device_id, boot, index): told for (boot, index), told in self._rig.pass_tallies().items()}
 
     def progress(self) -> float | None:
         """Share of the travel that lines have been placed on."""

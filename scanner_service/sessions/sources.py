@@ -93,7 +93,9 @@ class Pausable(Protocol):
 
 @runtime_checkable
 class OnAWire(Protocol):
-    """A source whose driver keeps an account of each pass."""
+    """A source whose driver keeps an account of each pass; `info` says which scanner it reads."""
+
+    info: DeviceInfo
 
     def pass_tallies(self) -> Mapping[PassKey, PassTally]:
         """Chunks and lines of each pass."""

@@ -92,7 +92,7 @@ def test_the_doctor_tells_absent_busy_and_bad_files_apart(bench, tmp_path):
     status, told, _ = run("doctor", bench(stage="/dev/ttyUSB99"))
     assert status == 1
     assert "/dev/ttyUSB99 does not exist" in told
-    assert "plug the scanner in" in told or "check the path" in told
+    assert "plug the device in and check the path" in told
     from drivers.port import Port
 
     held = Port(str(bench.stage_port.path), BAUD)
@@ -105,6 +105,34 @@ def test_the_doctor_tells_absent_busy_and_bad_files_apart(bench, tmp_path):
     status, _, complaint = run("doctor", tmp_path / "bad.toml")
     assert status == 1
     assert "[scanner] kind: must be a text" in complaint
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("/dev/nothere", "/dev/nothere does not exist or is not connected"),
+        ("/dev/null", "/dev/null is not a serial device"),
+        ("/dev", "/dev is not a serial device"),
+        ("", "'' is no path of a serial device"),
+        ("usb:1234:5678", "no adapter usb:1234:5678 is plugged in"),
+        ("usb:zz", "write usb:VID:PID or usb:VID:PID:SERIAL"),
+    ],
+)
+def test_a_port_that_is_not_there_is_told_in_one_sentence_and_nothing_else(name, said):
+    for command in (("devices", "--port", name), ("devices", "--identify", "--port", name), ("doctor", "--port", name)):
+        status, told, complaint = run(*command)
+        if command[:2] == ("devices", "--identify") and name == "/dev/null":
+            continue  # a character device: only opening it tells, see below
+        if command[0] == "devices" and name == "/dev/null":
+            assert status == 0
+            continue
+        assert status == 1, command
+        assert said in told + complaint
+        assert "survives a replug" not in told
+        assert "Errno" not in told + complaint
+    if name == "/dev/null":
+        _, told, _ = run("devices", "--identify", "--port", name, "--json")
+        assert said in json.loads(told)[0]["device"]["problem"]
 
 
 def test_the_udev_rule_is_printed_as_it_stands():

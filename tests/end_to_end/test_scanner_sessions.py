@@ -36,5 +36,10 @@ def test_a_part_on_a_conveyor_becomes_a_live_map(kind, running):
     assert status["points"] >= 20 * status["lines"] * (kind != "rplidar")
     assert device["lines"]["sent"] == device["lines"]["stored"] + sum(device["lines"]["lost"].values())
     assert device["rig"]["lines"] == status["lines"]
+    (account,) = status["losses"]["passes"]
+    assert account["lines"]["under_way"] == 0
+    assert account["lines"]["sent"] == account["lines"]["stored"] + sum(account["lines"]["lost"].values())
+    assert account["lines"]["stored"] == status["lines"]
+    assert account["device_id"] == status["calibration"]["scanner"]["device_id"]
     assert 0 < device["rig"]["median_step_mm"] < 2.5
     assert status["coverage"] > 0

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drivers.rig_limits import lines_between
 from drivers.scanline import Float64Array, Pose, read_only
 from scanner_service.rescan.passes.motion import Motion, StraightMotion
 from scanner_service.rescan.passes.needs import UNSEEN
@@ -79,7 +80,7 @@ class RecommendedPass:
     @property
     def line_count(self) -> int:
         """Lines, both ends included."""
-        return math.floor(abs(self.end_mm - self.start_mm) / self.line_spacing_mm + 1e-9) + 1
+        return lines_between(self.start_mm, self.end_mm, self.line_spacing_mm)
 
     @property
     def start_pose(self) -> Pose:

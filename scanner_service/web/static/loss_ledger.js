@@ -16,7 +16,14 @@ const NAMES = {
   record_busy: "the disk failed",
   service_ended: "under way when the service ended",
   too_late: "after the end",
+  outside_pass: "before and after the pass",
+  between_stops: "between two stops",
+  before_start: "before the stage set off",
+  no_position: "no stage position around it",
 };
+
+// Lines that were measured and not wanted: a rig's scanner runs on while its stage turns or goes to the next stop.
+const UNWANTED = new Set(["outside_pass", "between_stops", "before_start"]);
 
 const PLACES = { missing: "in a piece that never arrived" };
 
@@ -24,6 +31,7 @@ const sum = (tally) => Object.values(tally ?? {}).reduce((total, count) => total
 
 // Rows are [name, count, kind]: kept, aside (no loss: a laser that finds no surface, a line that came twice) or lost.
 const row = (key, count, kind, prefix = "") => [sentence(`${prefix}${NAMES[key] ?? key}`), count ?? 0, kind];
+const notStored = (lost) => Object.entries(lost ?? {}).map(([key, count]) => (UNWANTED.has(key) ? row(key, count, "aside", "not wanted: ") : row(key, count, "lost", "lost: ")));
 const rows = (tally, kind, prefix = "") => Object.entries(tally ?? {}).map(([key, count]) => row(key, count, kind, prefix));
 
 // [{title, unit, total, rows}], the total being null where nothing adds up to one.
@@ -52,7 +60,7 @@ function passAccounts(passes) {
     const boots = new Set(passes.filter((other) => other.device_id === device).map((other) => other.boot_id));
     const name = `Pass ${pass} of ${device}${boots.size > 1 ? `, boot ${boot}` : ""}`;
     const kept = [row("whole", lines.whole, "kept"), row("partial", lines.partial, "lost")];
-    return { title: name, unit: "scanlines sent", total: lines.sent, rows: [...kept, row("under_way", lines.under_way, "aside"), ...rows(lines.lost, "lost", "lost: ")] };
+    return { title: name, unit: "scanlines sent", total: lines.sent, rows: [...kept, row("under_way", lines.under_way, "aside"), ...notStored(lines.lost)] };
   });
 }
 

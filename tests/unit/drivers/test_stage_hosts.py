@@ -1,5 +1,7 @@
 """Conversations with stage controllers in simulated time: trust, arrival, stops that overtake, lost words, restarts."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -259,6 +261,34 @@ def test_marlin_that_halted_says_so() -> None:
     bench.ask(errand)
     assert isinstance(errand.failure, StageAlarm)
     assert not bench.host.position_known
+
+
+@pytest.mark.parametrize("lost", [1, 2, 3])
+@pytest.mark.parametrize("complaint", ["expected line 7 got 9", "Line Number is not Last Line Number+1, Last Line: 6"])
+def test_marlin_that_asks_for_a_line_again_in_any_words_is_sent_it_and_one_that_refuses_is_told(
+    complaint: str, lost: int
+) -> None:
+    bench = StageBench("marlin").homed()
+    errand = bench.host.move(15.0, 20.0, bench.now_s)
+    number = bench.host._sent.number
+    bench.host.receive(f"Error:{complaint}\nResend: {number}\nok\n".encode() * lost, bench.now_s)
+    assert bench.ask(errand).is_done
+    refused = bench.host.move(20.0, 20.0, bench.now_s)
+    bench.host.receive(b"Error:cold extrusion prevented\nok\n", bench.now_s)
+    assert isinstance(refused.failure, StageRefused)
+
+
+def test_marlin_that_answers_m114_on_the_line_of_its_ok_is_understood() -> None:
+    bench = StageBench("marlin")
+    bench.to_host = _ok_before_position
+    bench.homed()
+    assert bench.ask(bench.host.move(12.0, 20.0, bench.now_s)).is_done
+    assert bench.where == pytest.approx(12.0, abs=0.01)
+
+
+def _ok_before_position(data: bytes) -> bytes:
+    """A firmware's other habit: `X:.. Count ..` and the `ok` behind it become one line."""
+    return re.sub(rb"(?m)^(X:[^\n]*Count[^\n]*)\nok\n", rb"ok \1\n", data)
 
 
 @pytest.mark.parametrize("lost", [1, 2, 3])
