@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from typing import Any
 
 from sqlalchemy import Connection, Dialect, Table, delete, func, insert, select, update
@@ -33,6 +34,7 @@ from scanner_service.storage.tables import (
 from scanner_service.storage.tail import Tail, load_tail
 
 DELETE_SLICE_LINES = 256
+_ROWS_A_STATEMENT = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,10 +193,17 @@ class Batch:
     def finish(self) -> None:
         """Write the lines of the batch in one statement."""
         if self._rows:
-            statement, order = _line_insert(self._connection.dialect)
-            rows = self._rows if order is None else [tuple(map(row.__getitem__, order)) for row in self._rows]
-            self._connection.exec_driver_sql(statement, rows)
-            self._rows = []
+            insertion, rows, self._rows = _line_insert(self._connection.dialect), self._rows, []
+            if insertion.order is None:
+                self._connection.exec_driver_sql(insertion.one, rows)
+                return
+            values = [tuple(map(row.__getitem__, insertion.order)) for row in rows]
+            whole = len(values) - len(values) % _ROWS_A_STATEMENT
+            for first in range(0, whole, _ROWS_A_STATEMENT):
+                many = tuple(chain.from_iterable(values[first : first + _ROWS_A_STATEMENT]))
+                self._connection.exec_driver_sql(insertion.many, many)
+            if whole < len(values):
+                self._connection.exec_driver_sql(insertion.one, values[whole:])
 
     def _find(self, session_id: str, line: EncodedLine) -> Stored | None:
         """The answer for a line whose key is taken, None when it is free."""
@@ -310,15 +319,28 @@ def session_made_with(connection: Connection, key: CreationKey) -> SessionRow | 
     return session_from(dict(row))
 
 
-@cache
-def _line_insert(dialect: Dialect) -> tuple[str, tuple[str, ...] | None]:
-    """The statement that inserts lines, for the driver itself, and the order of its values; None for values by name.
+@dataclass(frozen=True, slots=True)
+class _Insertion:
+    """Statements for the driver itself: of one line, and of _ROWS_A_STATEMENT where values go by their `order`."""
 
-    Every scanline goes through it: asking SQLAlchemy for each batch would cost a third of what SQLite itself does.
+    one: str
+    many: str
+    order: tuple[str, ...] | None
+
+
+@cache
+def _line_insert(dialect: Dialect) -> _Insertion:
+    """How lines are inserted.
+
+    Every scanline goes through it. SQLAlchemy would ask a third of what SQLite itself does, and SQLite's module gives
+    the interpreter away with each row, and has to wait for it.
     """
     compiled = insert(lines).compile(dialect=dialect)
-    order = getattr(compiled, "positiontup", None)
-    return str(compiled), None if order is None else tuple(order)
+    one, order = str(compiled), getattr(compiled, "positiontup", None)
+    if order is None:
+        return _Insertion(one, "", None)
+    head, values, row = one.rpartition("VALUES ")
+    return _Insertion(one, head + values + ", ".join([row] * _ROWS_A_STATEMENT), tuple(order))
 
 
 def _notes_row(session_id: str, text: str, calibration: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.storage.errors import LineDamaged, NotStorable
-from scanner_service.storage.packing import pack, unpack
+from scanner_service.storage.packing import is_one_run, pack, unpack
 
 PLAIN, PACKED = 1, 2
 """Formats of a line."""
@@ -113,7 +113,7 @@ def decode_line(encoded: bytes) -> StoredLine:
 
 def _encode_index(index: npt.NDArray[np.int32]) -> tuple[int, npt.NDArray[np.int32]]:
     """The index as (first, length) of its runs of consecutive places, or as it is where that is shorter."""
-    if _is_one_run(index):  # nearly every line, and several times faster to tell than to look for runs
+    if is_one_run(index):  # nearly every line, and several times faster to tell than to look for runs
         return _INDEX_RUNS, np.array((index[0], len(index)), dtype="<i4")
     steps = index[1:].astype(np.int64) - index[:-1]
     starts = np.concatenate([np.zeros(min(len(index), 1), dtype=np.int64), np.flatnonzero(steps != 1) + 1])
@@ -121,13 +121,6 @@ def _encode_index(index: npt.NDArray[np.int32]) -> tuple[int, npt.NDArray[np.int
         return _INDEX_RAW, index.astype("<i4", copy=False)
     lengths = np.append(starts[1:], len(index)) - starts
     return _INDEX_RUNS, np.stack((index[starts], lengths), axis=1).astype("<i4").ravel()
-
-
-def _is_one_run(index: npt.NDArray[np.int32]) -> bool:
-    """True for more than two places that follow each other; a step that overflows shows at the last place."""
-    if len(index) < 3 or int(index[-1]) - int(index[0]) != len(index) - 1:
-        return False
-    return bool((index[1:] - index[:-1] == 1).all())
 
 
 def _decode_index(coding: int, words: npt.NDArray[np.int32], count: int) -> npt.NDArray[np.int32]:

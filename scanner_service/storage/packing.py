@@ -68,12 +68,26 @@ def unpack(packed: memoryview, count: int) -> npt.NDArray[np.int32]:
     return xyz_q
 
 
+def is_one_run(index: npt.NDArray[np.int32]) -> bool:
+    """True for more than two places (n,) that follow each other."""
+    return len(index) > 2 and bool(_is_one_run(index))
+
+
 def compile_packing() -> None:
-    """Compile the kernel, or load it from the cache."""
+    """Compile the kernels, or load them from the cache."""
     pack(np.zeros((2, 3), dtype=np.int32))
+    is_one_run(np.arange(3, dtype=np.int32))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
+def _is_one_run(index):  # type: ignore[no-untyped-def]
+    for place in range(1, len(index)):  # noqa: SIM110 - a kernel takes no generator
+        if np.int64(index[place]) - np.int64(index[place - 1]) != 1:
+            return False
+    return True
+
+
+@njit(cache=True)  # a few microseconds: giving the interpreter away for them costs more
 def _pack(xyz_q, room):  # type: ignore[no-untyped-def]
     """Fill `room` (uint8); returns how many bytes were used."""
     count = xyz_q.shape[0]
@@ -115,14 +129,14 @@ def _pack(xyz_q, room):  # type: ignore[no-untyped-def]
     return used
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def _step(xyz_q, row, column):  # type: ignore[no-untyped-def]
     """From one point to the next, as a 32-bit integer has it."""
     step = np.int64(xyz_q[row, column]) - np.int64(xyz_q[row - 1, column])
     return ((step + 2147483648) & 4294967295) - 2147483648
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, inline="always")
 def _put(room, place, value, width):  # type: ignore[no-untyped-def]
     for byte in range(width):
         room[place + byte] = (value >> (8 * byte)) & 255
