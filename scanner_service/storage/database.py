@@ -134,6 +134,8 @@ def check_identity(connection: sqlite3.Connection, path: Path) -> int:
         odd = connection.execute("SELECT count(*) FROM sqlite_master WHERE " + _IS_ODD).fetchone()[0]
     except sqlite3.DatabaseError as error:
         raise NotARecord(f"{path} cannot be opened as a record: {error}; choose another file") from error
+    except UnicodeDecodeError as error:  # SQLite quotes damaged text in its message
+        raise NotARecord(f"{path} cannot be opened as a record: its schema is damaged; choose another file") from error
     _check_marks(application, version, path)
     if odd:  # a view or a computed column in the place of a table runs whatever its author wanted
         raise NotARecord(f"{path} has views, triggers or computed columns, as no record has; choose another file")
