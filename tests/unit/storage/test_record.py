@@ -182,9 +182,8 @@ def test_nothing_is_acknowledged_while_the_disk_fails_and_everything_is_once_it_
         session = record.create_session("faults").session_id
         plan[:] = ["before"] * 10_000
         future = record.append(session, line_of(0))
-        while record.writer_state().state == "ok":
+        while (state := record.writer_state()).state == "ok":
             pass
-        state = record.writer_state()
         assert str(state) == "failing: disk I/O error" and state.waiting_lines == 1 and not future.done()
         assert list(record.lines(session)) == []
         plan.clear()
