@@ -77,7 +77,7 @@ def judge_planes(
     large, middle, small = moments[:, 0], moments[:, 1], moments[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.sqrt(middle * small) / (middle - small) / np.sqrt(effective - 3.0)
-    is_flat = (small <= 1e-14 * middle) & (middle > 0.0) & (effective > 3.0)
+    is_flat = (small <= 1e-14 * middle) & (middle > 0.0) & (count > 3)
     error = np.where(is_flat, 0.0, error)
     reason = np.full(len(count), NormalReason.GIVEN, dtype=np.uint8)
     reason[~(error <= max_error_rad)] = NormalReason.UNCERTAIN if max_error_rad < np.inf else NormalReason.GIVEN
