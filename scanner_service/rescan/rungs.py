@@ -25,6 +25,7 @@ _LANES = 3  # a chain may miss two lanes (dropouts)
 _SLANT = 2.0  # ends this many lane widths apart still follow each other: a rim at 30° to its lanes
 _ALIKE = 0.5  # the shorter of two rungs beside each other has at least this share of the longer
 _SLIP = 1.0 / 3.0  # ... and the ends that are further apart are so by at most this share of it
+_SHORT = 6.0  # radii: longer gaps are never of the surface that leads into them
 _SAME_WAY = np.cos(np.radians(45.0))
 
 
@@ -194,6 +195,21 @@ def settled_kinds(snapshot: MapSnapshot, strips: Strips, gaps: Gaps) -> Gaps:
         joined = (rungs.family[short] == rungs.family[other]) & (distance <= _LANES * rungs.width_mm[short])
         joined &= np.einsum("ij,ij->i", rungs.aside[short], rungs.aside[other]) > 0
         flank[short[joined]] = flank[other[joined]]
+    # what leaves a rim along the plane of one of its ends is surface that gave no return, not yet what the rim hides
+    near = (gaps.kind[rows] == GapKind.FLANK) & _leads_on(snapshot, strips, gaps, rows, length)
     kind = gaps.kind.copy()
-    kind[rows] = np.where(flank[rungs.of_gap], GapKind.FLANK, GapKind.SHADOW)
+    kind[rows] = np.where(flank[rungs.of_gap] | near, GapKind.FLANK, GapKind.SHADOW)
     return replace(gaps, kind=kind)
+
+
+def _leads_on(snapshot: MapSnapshot, strips: Strips, gaps: Gaps, rows: IntArray, length_mm: Float64Array) -> BoolArray:
+    """(k,) True for short gaps one of whose ends has a plane that leads to the other end."""
+    high, low = gaps.high[rows], gaps.low[rows]
+    vector = snapshot.points_mm[low] - snapshot.points_mm[high]
+    off = np.fmin(
+        np.abs(np.einsum("ij,ij->i", vector, snapshot.normals[high])),
+        np.abs(np.einsum("ij,ij->i", vector, snapshot.normals[low])),
+    )
+    reach = np.maximum(strips.reach_mm[high], strips.reach_mm[low])
+    leads: BoolArray = (off <= np.maximum(0.5 * reach, 0.2 * length_mm)) & (length_mm <= _SHORT * reach)
+    return leads
