@@ -139,7 +139,7 @@ def _directions(snapshot: MapSnapshot, stations: Stations, order: IntArray) -> F
 def _along_the_line(
     snapshot: MapSnapshot, order: IntArray, spacing: Float64Array, reach: Float64Array
 ) -> tuple[IntArray, Float64Array]:
-    """(n, 2) neighbours over unbroken segments; (n,) mean length of up to four, two on either side, lost places counted."""
+    """(n, 2) neighbours over unbroken segments; (n,) mean length of up to four segments, lost places counted."""
     chain = np.full((len(order), 2), -1, dtype=np.int64)
     result = np.full(len(order), np.nan)
     if len(order) < 2:
