@@ -25,6 +25,7 @@ from scanner_service.rescan.strips import Strips
 _LOST_GAP = 1.5  # station gaps above this many Δs with missing indices are lost lines
 _SPARSE_GAP = 1.25  # ... without missing indices: moved too fast
 _SLACK = 1.05  # a strip may be this much wider than the required density allows
+_ALIKE = float(np.cos(np.radians(30.0)))  # of normals of one surface
 _DOUBT = 1.25  # times the required density above which a point is good whatever is around it
 _STEEP_RAY = 0.5  # cosine of the incidence beyond which points are too far apart along the line
 
@@ -154,7 +155,7 @@ def judge(
         mean_width = np.where(both > 0, np.nansum(width, axis=1) / np.maximum(both, 1), np.nan)
         by_spacing = 1.0 / (mean_width * strips.point_spacing_mm)
         worst = 1.0 / (np.fmax(width[:, 0], width[:, 1]) * strips.point_spacing_mm)
-    too_few = _too_few(judged, counted_density, by_spacing, required, strips)
+    too_few = _too_few(snapshot, judged, counted_density, by_spacing, required, strips)
 
     ray = snapshot.points_mm - snapshot.lines.laser_mm[line]
     incidence = np.abs(np.einsum("ij,ij->i", ray, snapshot.normals)) / np.linalg.norm(ray, axis=1)
@@ -272,6 +273,7 @@ def _filled(snapshot: MapSnapshot, strips: Strips, failing: BoolArray, allowed_m
 
 
 def _too_few(
+    snapshot: MapSnapshot,
     judged: BoolArray,
     counted_per_mm2: Float64Array,
     by_spacing_per_mm2: Float64Array,
@@ -281,7 +283,8 @@ def _too_few(
     """(n,) True where count and spacing are both too low, in the mean of the points around: one alone errs by chance.
 
     Around a point are the two before and the two after it in its own line, and in the lines beside the nearest and
-    those next to it. Points far better than required need no look at their neighbours.
+    those next to it, as far as their normals are like its own: beyond an edge lies another surface. Points far better
+    than required need no look at their neighbours.
     """
     doubtful = judged & (counted_per_mm2 < _DOUBT * required) & ~(by_spacing_per_mm2 >= _DOUBT * required)
     rows = np.flatnonzero(doubtful)
@@ -292,6 +295,8 @@ def _too_few(
         around += [beside[:, None], _next_to(strips, beside)]
     near = np.concatenate(around, axis=1)
     known = (near >= 0) & judged[near]
+    known &= ~(np.einsum("kqj,kj->kq", snapshot.normals[near], snapshot.normals[rows]) < _ALIKE)
+    known[:, 0] = True
     counted = np.where(known, counted_per_mm2[near], 0.0).sum(axis=1) / known.sum(axis=1)
     known &= np.isfinite(by_spacing_per_mm2[near])
     with np.errstate(invalid="ignore", divide="ignore"):
