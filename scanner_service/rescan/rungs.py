@@ -71,8 +71,8 @@ def rungs_of(snapshot: MapSnapshot, strips: Strips, gaps: Gaps, rows: IntArray) 
         return Rungs(rows, rows, nowhere, nowhere, rows, rows, np.zeros(0), np.zeros(0), nowhere, nowhere, rows, rows)
     family = 2 * strips.group[high] + gaps.across[rows]
     # a gap whose upper end is the lower end of another in the same lane hangs below it
-    key = np.column_stack([family, gaps.lane[rows]])
-    lane = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    lanes = gaps.lane[rows] - gaps.lane[rows].min()
+    lane = np.unique(family * (int(lanes.max()) + 1) + lanes, return_inverse=True)[1].reshape(-1).astype(np.int64)
     base = len(snapshot) + 1
     by_top = np.argsort(lane * base + high, kind="stable")
     tops = (lane * base + high)[by_top]
@@ -156,7 +156,9 @@ def _nearest_pairs(rungs: Rungs) -> IntArray:
             near = near.reshape(len(mine), -1)
             pairs.append(np.column_stack([np.repeat(mine, near.shape[1]), mine[near.reshape(-1)]]))
     both = np.concatenate(pairs)
-    return np.unique(np.sort(both[both[:, 0] != both[:, 1]], axis=1), axis=0)
+    both = np.sort(both[both[:, 0] != both[:, 1]], axis=1)
+    once = np.unique(both[:, 0] * len(rungs) + both[:, 1])  # unique rows would keep other threads from their turn
+    return np.column_stack(np.divmod(once, len(rungs)))
 
 
 def walks(after: IntArray, before: IntArray) -> list[IntArray]:
