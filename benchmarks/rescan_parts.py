@@ -119,7 +119,7 @@ def drawn(seed: int) -> trimesh.Trimesh:
     Slopes lie between 30 and 78 degrees, everything is turned about the vertical by any angle.
     """
     rng = np.random.default_rng(seed)
-    bodies, cutters = [slab((-22.0, 0.0, -14.0), (22.0, 62.0, 0.0))], []
+    bodies, cutters = [slab((-22.0, 0.0, -14.0), (22.0, 62.0, 0.0))], list[trimesh.Trimesh]()
     for at, kind in enumerate(rng.choice(["roof", "ball", "post", "block", "pocket", "bowl", "hole"], size=6)):
         x, y = -11.0 + 22.0 * (at % 2), 11.0 + 20.0 * (at // 2)
         size, height = rng.uniform(4.0, 8.0), rng.uniform(3.0, 9.0)
@@ -143,7 +143,10 @@ def drawn(seed: int) -> trimesh.Trimesh:
             half = rng.uniform(2.0, 7.0, size=2)
             low, high = (-0.5, height) if kind == "block" else (-height, 2.0)
             body = slab((-half[0], -half[1], low), (half[0], half[1], high))
-        body.apply_transform(trimesh.transformations.rotation_matrix(rng.uniform(0.0, 2.0 * np.pi), [0.0, 0.0, 1.0]))
+        turn = rng.uniform(0.0, 2.0 * np.pi)
+        turned = np.eye(4)
+        turned[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+        body.apply_transform(turned)
         body.apply_translation((x, y, 0.0))
         (cutters if kind in ("pocket", "bowl", "hole") else bodies).append(body)
     part = join(*bodies)
