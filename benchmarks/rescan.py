@@ -6,20 +6,23 @@ python -m benchmarks.rescan --json FILE [--meshes FOLDER] [--part NAME]
 import argparse
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial import cKDTree
 
 from benchmarks.rescan_flagged import Agreement, agreements
-from benchmarks.rescan_parts import PARTS, mesh_from
+from benchmarks.rescan_parts import PARTS, drawn, mesh_from
 from benchmarks.rescan_truth import Bools, Caster, Floats, Optics, Sweep, sample_surface, sight_of, truth_of
 from drivers.scanline import Pose, Scanline
 from scanner_service.analysis.intake import quantise
 from scanner_service.analysis.live_map import LiveMap, MapSettings
 from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.regions import RegionReport, find_regions
 from scanner_service.rescan.requirement import Requirement
 from simulators.meshes import TriangleMesh
@@ -29,12 +32,13 @@ LINE_SPACING_MM = 0.2
 CONSTANT_MM = 0.1
 NOISE_MM = 0.01
 NOISY_FACTOR = 8.0
+ISOLATED = "isolated"
 MESHES = ("fandisk.obj", "gears.stl", "featuretype.STL")
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One scan with what went wrong in it: a part, a range, the lines that were fast or lost, a noisy box."""
+    """One scan with what went wrong in it: a part, a range, fast or lost lines, a noisy box, stray returns."""
 
     name: str
     part: trimesh.Trimesh
@@ -42,11 +46,12 @@ class Case:
     fast_mm: tuple[float, float] = (np.inf, np.inf)
     lost_mm: tuple[tuple[float, float], ...] = ()
     noisy_mm: tuple[float, float, float, float] | None = None  # x, y low and high
+    strays: int = 0  # specks in the air: one to three returns beside each other, 2 to 10 mm in front of the part
 
 
-def cases(only: str | None = None, meshes: Path | None = None) -> list[Case]:
-    """The cases of the generated parts, and of the mesh files of a folder."""
-    found = []
+def cases(only: str | None = None, meshes: Path | None = None, drawn_seeds: Sequence[int] = ()) -> list[Case]:
+    """The cases of the generated parts, of parts drawn by chance, and of the mesh files of a folder."""
+    found = [Case(f"drawn {seed}", drawn(seed)) for seed in drawn_seeds]
     for name, make in PARTS.items():
         if only in (None, name):
             if name == "bowl":
@@ -56,6 +61,8 @@ def cases(only: str | None = None, meshes: Path | None = None) -> list[Case]:
                 found.append(Case(name, make(), fast_mm=(5.0, 20.0), lost_mm=lost, noisy_mm=(-10.0, 8.0, 46.0, 62.0)))
             else:
                 found.append(Case(name, make()))
+    if only in (None, "strays"):
+        found.append(Case("strays", PARTS["waves"](), strays=80))
     if meshes is not None:
         found += [
             Case(path.name, mesh_from(path))
@@ -93,9 +100,20 @@ def sweep_for(case: Case) -> Sweep:
     )
 
 
+def specks(case: Case, scanner: LaserLineScanner, sweep: Sweep, seed: int) -> dict[int, list[tuple[int, int, float]]]:
+    """The stray returns of a scan by the number of their line: first ray, rays and millimetres towards the laser."""
+    rng = np.random.default_rng([seed, 9])
+    found: dict[int, list[tuple[int, int, float]]] = {}
+    for number in rng.choice(sweep.numbers[12:-12], size=case.strays, replace=False).tolist():
+        first = int(rng.integers(80, scanner.points_per_line - 120))
+        found[number] = [(first, int(rng.integers(1, 4)), float(rng.uniform(2.0, 10.0)))]
+    return found
+
+
 def scan(case: Case, scanner: LaserLineScanner, sweep: Sweep, seed: int = 1) -> MapSnapshot:
     """Scan the part; the live map of it when the pass is closed."""
     rng = np.random.default_rng(seed)
+    strays = specks(case, scanner, sweep, seed)
     surface = TriangleMesh(np.asarray(case.part.vertices), np.asarray(case.part.faces), Pose.identity())
     live = LiveMap(MapSettings(noise_mm=NOISE_MM, max_points=scanner.points_per_line * len(sweep.stations_mm) + 1))
     before = np.nan
@@ -106,6 +124,9 @@ def scan(case: Case, scanner: LaserLineScanner, sweep: Sweep, seed: int = 1) -> 
         if case.noisy_mm is not None:
             noisy = is_in(points, case.noisy_mm)
             points[noisy, 2] += NOISE_MM * NOISY_FACTOR * rng.standard_normal(int(noisy.sum()))
+        for first, count, towards_mm in strays.get(number, ()):
+            way = pose.apply(scanner.laser_mm) - points[first : first + count]
+            points[first : first + count] += towards_mm * way / np.linalg.norm(way, axis=1, keepdims=True)
         line = Scanline(
             device_id="benchmark",
             boot_id=1,
@@ -155,7 +176,12 @@ def compare(case: Case, spacing_mm: float) -> tuple[dict[str, Agreement], dict[s
     begun_s = time.perf_counter()
     snapshot, report, scanner, sweep, requirement = judged(case)
     optics = Optics(
-        scanner.laser_mm, scanner.camera_mm, scanner.field_of_view_mm, scanner.range_mm, scanner.points_per_line
+        scanner.laser_mm,
+        scanner.camera_mm,
+        scanner.field_of_view_mm,
+        scanner.range_mm,
+        scanner.points_per_line,
+        scanner.dropout_exponent,
     )
     caster, samples = Caster(case.part), sample_surface(case.part, spacing_mm)
     sight = sight_of(caster, samples, optics, sweep)
@@ -165,6 +191,7 @@ def compare(case: Case, spacing_mm: float) -> tuple[dict[str, Agreement], dict[s
     truth = truth_of(caster, samples, sight, optics, sweep, requirement.density_per_mm2, CONSTANT_MM, is_noisy)
     radius = float(np.sqrt(2.0)) * LINE_SPACING_MM + CONSTANT_MM
     found = agreements(report.regions, case.part, samples, sight, truth, optics, sweep, radius)
+    found[ISOLATED] = isolated_returns(snapshot, report, specks(case, scanner, sweep, 1), radius)
     about = {
         "points": len(snapshot),
         "regions": len(report.regions),
@@ -172,6 +199,30 @@ def compare(case: Case, spacing_mm: float) -> tuple[dict[str, Agreement], dict[s
         "seconds": time.perf_counter() - begun_s,
     }
     return found, about
+
+
+def isolated_returns(
+    snapshot: MapSnapshot, report: RegionReport, strays: dict[int, list[tuple[int, int, float]]], radius_mm: float
+) -> Agreement:
+    """How the verdict `isolated` agrees with the truth, in returns and not in mm2, for such points have no area.
+
+    True: at most two other returns within the radius, counted here by a tree of all returns. What is found counts of
+    the strays; returns of the part's own surface that stand alone may have another reason first.
+    """
+    alone = cKDTree(snapshot.points_mm).query_ball_point(snapshot.points_mm, radius_mm, return_length=True) <= 3
+    stray = np.zeros(len(snapshot), dtype=bool)
+    number = snapshot.lines.line_index[snapshot.line]
+    for line, groups in strays.items():
+        for first, count, _ in groups:
+            stray |= (number == line) & (snapshot.index >= first) & (snapshot.index < first + count)
+    flagged = report.reason == Reason.ISOLATED
+    true = alone & stray
+    return Agreement(
+        *(
+            float(np.count_nonzero(marks))
+            for marks in (true, true & flagged, flagged, flagged & alone, true & (report.reason != Reason.NONE))
+        )
+    )
 
 
 def run(case_list: list[Case], spacing_mm: float) -> dict[str, Any]:
@@ -191,8 +242,9 @@ def run(case_list: list[Case], spacing_mm: float) -> dict[str, Any]:
 
 
 def _line(head: str, agreement: Agreement) -> str:
+    unit = "returns" if ISOLATED in head else "mm2"
     return (
-        f"{head} true {agreement.true_mm2:8.1f} mm2  flagged {agreement.flagged_mm2:8.1f} mm2  "
+        f"{head} true {agreement.true_mm2:8.1f} {unit}  flagged {agreement.flagged_mm2:8.1f} {unit}  "
         f"recall {100 * agreement.recall:6.2f} %  precision {100 * agreement.precision:6.2f} %  "
         f"(flagged for any reason {100 * agreement.found_any_mm2 / max(agreement.true_mm2, 1e-9):6.2f} %)"
     )
@@ -214,9 +266,14 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--meshes", type=Path, help="folder with fandisk.obj, gears.stl, featuretype.STL")
     parser.add_argument("--part", help="one part only")
+    parser.add_argument(
+        "--drawn", type=int, nargs="*", default=[], help="seeds of parts drawn by chance, beside the others"
+    )
+    parser.add_argument("--drawn-only", action="store_true", help="nothing but the parts drawn by chance")
     parser.add_argument("--spacing", type=float, default=0.15, help="distance of the truth's samples, mm")
     chosen = parser.parse_args()
-    figures = run(cases(chosen.part, chosen.meshes), chosen.spacing)
+    wanted = "" if chosen.drawn_only else chosen.part
+    figures = run(cases(wanted, None if chosen.drawn_only else chosen.meshes, chosen.drawn), chosen.spacing)
     if chosen.json is not None:
         chosen.json.parent.mkdir(parents=True, exist_ok=True)
         chosen.json.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n")

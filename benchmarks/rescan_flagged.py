@@ -174,8 +174,7 @@ def _ribbons(
         way += 1.02 * normal
         way /= np.linalg.norm(way, axis=1, keepdims=True)
         start = samples.points_mm[left] + _LIFT_MM * normal
-        triangle = caster.triangle(start, way)
-        distance = caster.distance_mm(start, way)
+        distance, triangle = caster.first_hit(start, way)
         mine = triangle >= first
         closed[left[mine]] = distance[mine] <= np.maximum(width[triangle[mine] - first], radius_mm)
     count = max(1, int(ribbon.area / samples.area_mm2))

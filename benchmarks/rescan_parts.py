@@ -113,6 +113,46 @@ def ball() -> trimesh.Trimesh:
     return join(slab((-20.0, 0.0, -10.0), (20.0, 48.0, -4.0)), sphere)
 
 
+def drawn(seed: int) -> trimesh.Trimesh:
+    """A plate with six bodies and hollows drawn by chance: roofs, balls, posts, blocks, pockets, bowls and holes.
+
+    Slopes lie between 30 and 78 degrees, everything is turned about the vertical by any angle.
+    """
+    rng = np.random.default_rng(seed)
+    bodies, cutters = [slab((-22.0, 0.0, -14.0), (22.0, 62.0, 0.0))], list[trimesh.Trimesh]()
+    for at, kind in enumerate(rng.choice(["roof", "ball", "post", "block", "pocket", "bowl", "hole"], size=6)):
+        x, y = -11.0 + 22.0 * (at % 2), 11.0 + 20.0 * (at // 2)
+        size, height = rng.uniform(4.0, 8.0), rng.uniform(3.0, 9.0)
+        if kind == "roof":
+            run = height / np.tan(np.radians(rng.uniform(30.0, 78.0, size=2)))
+            run = np.minimum(run, 6.0)
+            outline = [(-1.0 - run[0], -0.5), (-1.0, height), (1.0, height), (1.0 + run[1], -0.5)]
+            body = prism_along_x([(float(a), float(b)) for a, b in outline], (-size, size))
+        elif kind == "ball":
+            body = trimesh.creation.icosphere(subdivisions=5, radius=size)
+            body.apply_translation((0.0, 0.0, rng.uniform(-0.3, 0.6) * size))
+        elif kind in ("post", "hole"):
+            body = trimesh.creation.cylinder(radius=0.8 * size, height=2.0 * height, sections=_TOP)
+            if kind == "hole":
+                body = trimesh.creation.cylinder(radius=0.5 * size, height=60.0, sections=_TOP)
+        elif kind == "bowl":
+            body = trimesh.creation.cone(radius=size + 1.0, height=min(height, 8.0) + 1.0, sections=96)
+            body.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
+            body.apply_translation((0.0, 0.0, 1.0))
+        else:
+            half = rng.uniform(2.0, 7.0, size=2)
+            low, high = (-0.5, height) if kind == "block" else (-height, 2.0)
+            body = slab((-half[0], -half[1], low), (half[0], half[1], high))
+        turn = rng.uniform(0.0, 2.0 * np.pi)
+        turned = np.eye(4)
+        turned[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+        body.apply_transform(turned)
+        body.apply_translation((x, y, 0.0))
+        (cutters if kind in ("pocket", "bowl", "hole") else bodies).append(body)
+    part = join(*bodies)
+    return cut(part, *cutters) if cutters else part
+
+
 PARTS: dict[str, Callable[[], trimesh.Trimesh]] = {
     "wedges": wedges,
     "pockets": pockets,

@@ -8,17 +8,20 @@ reason's truth is an inequality (`truth_of`):
     Δs'           g·|t·m| / sqrt(1 - (n·m)²), g the gap between the two lines around the sample
     δp'           D·dα / |d·e|: the angle between rays times the distance, on the surface (d along the line, e across
                   the ray)
-    lost_lines    visible, line numbers missing in the gap, g > 1.5 Δs, 1/(Δs'·δp') < ρ
-    steep         visible, not lost, Δs'/g > sqrt(2) + c/Δs, or 1/(Δs'·δp') < ρ at an incidence of more than 60°
-    sparse        visible, neither of these, 1/(Δs'·δp') < ρ
+    lost_lines    visible, line numbers missing in the gap, g > 1.5 Δs, q/(Δs'·δp') < ρ
+    steep         visible, not lost, Δs'/g > sqrt(2) + c/Δs, or q/(Δs'·δp') < ρ at an incidence of more than 60°
+    sparse        visible, neither of these, q/(Δs'·δp') < ρ
     out_of_range  visible but for z < z_low or z > z_high
     shadow        in the fan and in range, neither visible nor grazing, but beside what is: in some direction one looks
-                  from it into the space between the laser and visible surface (so the end of the part is none, nor is
-                  a cavity that no gap in the scan betrays; the walls of a hole right through are, as one looks up out
-                  of it, though no verdict calls them a shadow: they count as missed)
+                  from it into the space between the laser and visible surface (a cavity that no gap in the scan betrays
+                  is none); and not the end of the part: of the directions in which one looks from it into air that the
+                  laser passes without grazing what is behind, at least half meet first such air with surface behind,
+                  seen or not, in fan and range (an outer side with nothing beside it is none, nor is the wall of a hole
+                  right through)
     noisy         visible, and the noise there above the limit
 
-Beyond 80° fewer than half of the rays return: such `grazing` surface may be seen or not, and is left out. ρ is the
+q is the share of the rays that return from an incidence, a property of the scanner: 1 - (1 - cos incidence)^e. Beyond
+80° fewer than half of the rays return: such `grazing` surface may be seen or not, and is left out. ρ is the
 required density less 5 % (what a scan cannot tell). `band_of` marks the samples within one radius of a sample of the
 other truth.
 """
@@ -43,6 +46,9 @@ _WALL = float(np.cos(np.radians(80.0)))
 _SLACK = 1.05
 _DIRECTIONS = 32
 _FAR_MM = 25.0  # how far a shadow's surface looks for the space beside it
+_SHARES = (0.1, 0.35, 0.65, 0.95)  # ... and at which shares of that way
+_VOTES = 12  # directions that tell the end of the part, each followed in small steps to the first light
+_STEPS = (0.02, 0.04, 0.06, 0.08, 0.11, 0.15, 0.2, 0.28, 0.4, 0.55, 0.75, 0.95)
 REASONS = ("steep", "sparse", "lost_lines", "out_of_range", "shadow", "noisy")
 
 
@@ -50,7 +56,8 @@ REASONS = ("steep", "sparse", "lost_lines", "out_of_range", "shadow", "noisy")
 class Optics:
     """A laser-line scanner in its sensor frame: laser plane y = 0, x along the line, z towards the sensor.
 
-    `laser_mm`, `camera_mm` (3,); the fan's `rays` cut z = 0 at equal steps over `field_of_view_mm`.
+    `laser_mm`, `camera_mm` (3,); the fan's `rays` cut z = 0 at equal steps over `field_of_view_mm`. Of the rays
+    (1 - cos incidence)^`dropout_exponent` do not return; infinite: all do.
     """
 
     laser_mm: Floats
@@ -58,6 +65,7 @@ class Optics:
     field_of_view_mm: float
     range_mm: tuple[float, float]
     rays: int
+    dropout_exponent: float = np.inf
 
     @property
     def point_spacing_mm(self) -> float:
@@ -113,12 +121,15 @@ class Caster:
         distance = np.asarray(found, dtype=np.float64)
         return np.where(distance < 1e30, distance, np.inf)
 
-    def triangle(self, origins_mm: Floats, directions: Floats) -> Ints:
-        """(n,) index of the triangle first hit; -1 where there is none."""
+    def first_hit(self, origins_mm: Floats, directions: Floats) -> tuple[Floats, Ints]:
+        """(n,) distance to the first hit and (n,) the triangle hit; inf and -1 where there is none."""
         if not len(origins_mm):
-            return np.zeros(0, dtype=np.int64)
+            return np.zeros(0), np.zeros(0, dtype=np.int64)
         start = np.ascontiguousarray(origins_mm - self._centre, dtype=np.float32)
-        return np.asarray(self._scene.run(start, np.ascontiguousarray(directions, dtype=np.float32)), dtype=np.int64)
+        found = self._scene.run(start, np.ascontiguousarray(directions, dtype=np.float32), output=1)
+        triangle = np.asarray(found["primID"], dtype=np.int64)
+        distance = np.asarray(found["tfar"], dtype=np.float64)
+        return np.where(triangle >= 0, distance, np.inf), triangle
 
     def is_free(self, origins_mm: Floats, targets_mm: Floats) -> Bools:
         """(n,) True where nothing stands between origin and target (n, 3)."""
@@ -237,7 +248,8 @@ def truth_of(
     gap = sweep.stations_mm[after] - sweep.stations_mm[after - 1]
     missing = sweep.numbers[after] - sweep.numbers[after - 1] > 1
     with np.errstate(divide="ignore"):
-        is_thin = 1.0 / (gap * sight.stretch * sight.along_mm) < density_per_mm2 / _SLACK
+        returned = 1.0 - (1.0 - np.clip(np.cos(sight.incidence_rad), 0.0, 1.0)) ** optics.dropout_exponent
+        is_thin = returned / (gap * sight.stretch * sight.along_mm) < density_per_mm2 / _SLACK
     lost = visible & missing & (gap > 1.5 * sweep.line_spacing_mm) & is_thin
     beyond = sight.stretch > np.sqrt(2.0) + constant_mm / sweep.line_spacing_mm
     steep = visible & ~lost & (beyond | (is_thin & (np.cos(sight.incidence_rad) < _GRAZING)))
@@ -253,47 +265,63 @@ def truth_of(
 
 
 def _shadow(caster: Caster, samples: Samples, sight: Sight, optics: Optics, sweep: Sweep) -> Bools:
-    """Hidden surface beside what is seen: from it one looks into the space between the laser and seen surface."""
-    shadow = np.zeros(len(samples), dtype=bool)
+    """Hidden surface beside what is seen, and not the end of the part."""
     hidden = np.flatnonzero(sight.in_fan & sight.in_range & ~sight.visible & ~sight.grazing)
+    beside_seen = np.zeros(len(hidden), dtype=np.bool_)
+    over_part, over_nothing = np.zeros(len(hidden), dtype=np.int64), np.zeros(len(hidden), dtype=np.int64)
     rng = np.random.default_rng(2)
+    normals = samples.normals[hidden]
+    start = samples.points_mm[hidden] + _LIFT_MM * normals
     for number in range(_DIRECTIONS):
-        left = hidden[~shadow[hidden]]
-        normals = samples.normals[left]
-        way = rng.normal(size=(len(left), 3))
+        way = rng.normal(size=(len(hidden), 3))
         way /= np.linalg.norm(way, axis=1, keepdims=True)
         way = normals.copy() if number == 0 else way + 1.02 * normals
         way /= np.linalg.norm(way, axis=1, keepdims=True)
-        start = samples.points_mm[left] + _LIFT_MM * normals
         free = np.minimum(caster.distance_mm(start, way), _FAR_MM)
-        for share in (0.1, 0.35, 0.65, 0.95):
-            open_ = ~shadow[left]
-            there = start[open_] + share * free[open_, None] * way[open_]
-            shadow[left[open_]] = _is_looked_through(caster, there, optics, sweep)
+        first = np.full(len(hidden), number < _VOTES)
+        for share in _STEPS if number < _VOTES else _SHARES:
+            asked = np.flatnonzero(first | ~beside_seen)
+            passes, meets, seen = _light_at(
+                caster, start[asked] + share * free[asked, None] * way[asked], optics, sweep
+            )
+            beside_seen[asked[seen]] = True
+            fresh = passes & first[asked]
+            over_part[asked[fresh & meets]] += 1
+            over_nothing[asked[fresh & ~meets]] += 1
+            first[asked[fresh]] = False
+    shadow = np.zeros(len(samples), dtype=bool)
+    shadow[hidden] = beside_seen & (over_part >= over_nothing)
     return shadow
 
 
-def _is_looked_through(caster: Caster, places_mm: Floats, optics: Optics, sweep: Sweep) -> Bools:
-    """(n,) True for places in the air that the laser reaches, with seen surface behind."""
+def _light_at(caster: Caster, places_mm: Floats, optics: Optics, sweep: Sweep) -> tuple[Bools, Bools, Bools]:
+    """(n,) of places in the air: whether the laser's light passes, lights the part behind, and is seen there.
+
+    Light that grazes the part behind, as it does beside a wall along its way, passes for none of this.
+    """
     t = sweep.travel
     station = scan_coordinates(places_mm, optics, sweep)[0]
     base = sweep.origin_mm + station[:, None] * t
     laser, camera = base + optics.laser_mm @ sweep.rotation.T, base + optics.camera_mm @ sweep.rotation.T
     ray = places_mm - laser
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    distance, face = caster.distance_mm(laser, ray), caster.triangle(laser, ray)
-    past = np.isfinite(distance) & (face >= 0) & (distance > np.linalg.norm(places_mm - laser, axis=1))
-    past &= (station >= sweep.stations_mm[0]) & (station <= sweep.stations_mm[-1])
-    foot = laser[past] + distance[past, None] * ray[past]
-    normals = caster.normals[face[past]]
-    own = _in_sensor(foot, station[past], sweep)
-    seen = -np.einsum("ij,ij->i", normals, ray[past]) >= _WALL
-    seen &= (np.einsum("ij,ij->i", normals, camera[past] - foot) > 0) & _fan_holds(own, optics)
-    seen &= (own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1])
-    seen[seen] = caster.is_free((foot + _LIFT_MM * normals)[seen], camera[past][seen])
-    looked = np.zeros(len(places_mm), dtype=np.bool_)
-    looked[np.flatnonzero(past)[seen]] = True
-    return looked
+    distance, face = caster.first_hit(laser, ray)
+    passes = distance > np.linalg.norm(places_mm - laser, axis=1)
+    within = (station >= sweep.stations_mm[0]) & (station <= sweep.stations_mm[-1])
+    meets, seen = passes & (face >= 0) & within, np.zeros(len(places_mm), dtype=np.bool_)
+    rows = np.flatnonzero(meets)
+    foot = laser[rows] + distance[rows, None] * ray[rows]
+    own = _in_sensor(foot, station[rows], sweep)
+    held = _fan_holds(own, optics) & (own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1])
+    meets[rows[~held]] = False
+    normals = caster.normals[face[rows]]
+    lights = -np.einsum("ij,ij->i", normals, ray[rows]) >= _WALL
+    passes[rows[held & ~lights]] = False
+    clear = held & lights
+    clear &= np.einsum("ij,ij->i", normals, camera[rows] - foot) > 0
+    clear[clear] = caster.is_free((foot + _LIFT_MM * normals)[clear], camera[rows][clear])
+    seen[rows[clear]] = True
+    return passes, np.asarray(meets & passes), seen
 
 
 def _fan_holds(own_mm: Floats, optics: Optics) -> Bools:

@@ -13,7 +13,8 @@ of the fan in the scanlines of a pass. Between the two ends A and B of such a pa
 - *out of range*: both ends stand near an end of the measurement range;
 - a *hole*: anything else. An inner border of the part, or dropouts: not a reason by itself. So is a jump over places
   without a return to a lone return from which the surface rises again at once: the far wall of a hole; and, without
-  a geometry, to a lower end without a sure plane or that the ray grazes: the silhouette of something behind.
+  a geometry, to a lower end without a sure plane or that the ray grazes: the silhouette of something behind. So is
+  what lies between the surface and an isolated return in front of it.
 """
 
 from dataclasses import dataclass
@@ -134,12 +135,15 @@ def find_gaps(
         _classified(snapshot, stations, strips, fan, geometry, first, second, width, lane, across)
         for (first, second, width, lane), across in zip(pairs, (False, True), strict=True)
     ]
+    high = np.concatenate([part.high for part in parts])
+    kind = np.concatenate([part.kind for part in parts])
+    kind[_in_the_air(snapshot, strips)[high]] = GapKind.HOLE
     return Gaps(
-        high=np.concatenate([part.high for part in parts]),
+        high=high,
         low=np.concatenate([part.low for part in parts]),
         across=np.concatenate([part.across for part in parts]),
         width_mm=np.concatenate([part.width_mm for part in parts]),
-        kind=np.concatenate([part.kind for part in parts]),
+        kind=kind,
         lane=np.concatenate([part.lane for part in parts]),
     )
 
@@ -243,7 +247,11 @@ def _classified(
     if geometry is None:
         silhouette[:] = False
     kind[jump | silhouette] = GapKind.SHADOW
-    kind[(jump & goes_on) | (steep & ~leaves_surface & ~silhouette)] = GapKind.FLANK
+    # far below stands a surface that faces the laser and leads nowhere near: no flank comes down to it
+    plane = np.where((drop >= 0)[:, None], snapshot.normals[second], snapshot.normals[first])
+    foot = (length > _FAR_BELOW * reach) & (np.abs(np.einsum("ij,ij->i", plane, ray)) >= _FACING)
+    foot &= np.where(drop >= 0, off_second, off_first) > on_tangent_mm
+    kind[(jump & goes_on & ~foot) | (steep & ~leaves_surface & ~silhouette)] = GapKind.FLANK
     settled = snapshot.settled[first] & snapshot.settled[second]
     rows = np.flatnonzero((steep | apart) & settled)
     kind[rows] = np.where(
@@ -258,6 +266,29 @@ def _classified(
         kind=kind[rows],
         lane=lane[rows],
     )
+
+
+def _in_the_air(snapshot: MapSnapshot, strips: Strips) -> BoolArray:
+    """(n,) True for isolated returns nearer to the laser than the surface on both sides of them in their line.
+
+    They hide nothing: a speck of dust, a droplet, a stray reflection.
+    """
+    stray = np.zeros(len(snapshot), dtype=bool)
+    order = strips.order[snapshot.neighbours[strips.order] > 0]
+    lone = snapshot.isolated[order]
+    if not lone.any() or lone.all():
+        return stray
+    place = np.arange(len(order))
+    before = np.maximum.accumulate(np.where(lone, -1, place))
+    after = np.minimum.accumulate(np.where(lone, len(order), place)[::-1])[::-1]
+    rows = np.flatnonzero(lone & (before >= 0) & (after < len(order)))
+    own, left, right = order[rows], order[before[rows]], order[after[rows]]
+    line = snapshot.line
+    within = (line[left] == line[own]) & (line[right] == line[own])
+    laser = snapshot.lines.laser_mm[line[own]]
+    away, left_away, right_away = (np.linalg.norm(snapshot.points_mm[of] - laser, axis=1) for of in (own, left, right))
+    stray[own] = within & (np.fmin(left_away, right_away) > away + strips.reach_mm[own])
+    return stray
 
 
 def _far_walls(first: IntArray, second: IntArray, steep: BoolArray, drop: Float64Array, lost: IntArray) -> BoolArray:

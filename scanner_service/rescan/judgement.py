@@ -19,12 +19,14 @@ from scanner_service.rescan.curvature import curvature_across_per_mm
 from scanner_service.rescan.gaps import Fan, GapKind, Gaps, near_range_end
 from scanner_service.rescan.noise import noise_along_lines
 from scanner_service.rescan.requirement import Requirement
-from scanner_service.rescan.stations import Stations
+from scanner_service.rescan.stations import IntArray, Stations
 from scanner_service.rescan.strips import Strips
 
 _LOST_GAP = 1.5  # station gaps above this many Δs with missing indices are lost lines
 _SPARSE_GAP = 1.25  # ... without missing indices: moved too fast
 _SLACK = 1.05  # a strip may be this much wider than the required density allows
+_ALIKE = float(np.cos(np.radians(30.0)))  # of normals of one surface
+_DOUBT = 1.25  # times the required density above which a point is good whatever is around it
 _STEEP_RAY = 0.5  # cosine of the incidence beyond which points are too far apart along the line
 
 
@@ -117,6 +119,7 @@ def judge(
     if requirement.density_per_mm2 is None:
         required = _no_more_than_the_first_pass(required, strips)
     counted_density = border_aware(snapshot.side_density_per_mm2, snapshot.offset)
+    counted_density = np.where(snapshot.isolated, snapshot.side_density_per_mm2, counted_density)  # no disc to speak of
     judged = snapshot.settled & (snapshot.neighbours > 0) & np.isfinite(required)
     if requirement.interest is not None:
         judged &= requirement.interest.holds(snapshot.points_mm)
@@ -152,7 +155,7 @@ def judge(
         mean_width = np.where(both > 0, np.nansum(width, axis=1) / np.maximum(both, 1), np.nan)
         by_spacing = 1.0 / (mean_width * strips.point_spacing_mm)
         worst = 1.0 / (np.fmax(width[:, 0], width[:, 1]) * strips.point_spacing_mm)
-    too_few = judged & (counted_density < required) & ~(by_spacing >= required / _SLACK)
+    too_few = _too_few(snapshot, judged, counted_density, by_spacing, required, strips)
 
     ray = snapshot.points_mm - snapshot.lines.laser_mm[line]
     incidence = np.abs(np.einsum("ij,ij->i", ray, snapshot.normals)) / np.linalg.norm(ray, axis=1)
@@ -267,6 +270,46 @@ def _filled(snapshot: MapSnapshot, strips: Strips, failing: BoolArray, allowed_m
         enough &= nearest <= 0.5 * _SLACK * allowed_mm[rows]
     filled[rows, side] = enough
     return filled
+
+
+def _too_few(
+    snapshot: MapSnapshot,
+    judged: BoolArray,
+    counted_per_mm2: Float64Array,
+    by_spacing_per_mm2: Float64Array,
+    required: Float64Array,
+    strips: Strips,
+) -> BoolArray:
+    """(n,) True where count and spacing are both too low, in the mean of the points around: one alone errs by chance.
+
+    Around a point are the two before and the two after it in its own line, and in the lines beside the nearest and
+    those next to it, as far as their normals are like its own: beyond an edge lies another surface. Points far better
+    than required need no look at their neighbours.
+    """
+    doubtful = judged & (counted_per_mm2 < _DOUBT * required) & ~(by_spacing_per_mm2 >= _DOUBT * required)
+    rows = np.flatnonzero(doubtful)
+    around = [rows[:, None], strips.chain[rows]]
+    around += [_next_to(strips, strips.chain[rows, side])[:, side, None] for side in (0, 1)]
+    for side in (0, 1):
+        beside = strips.link[rows, side]
+        around += [beside[:, None], _next_to(strips, beside)]
+    near = np.concatenate(around, axis=1)
+    known = (near >= 0) & judged[near]
+    known &= ~(np.einsum("kqj,kj->kq", snapshot.normals[near], snapshot.normals[rows]) < _ALIKE)
+    known[:, 0] = True
+    counted = np.where(known, counted_per_mm2[near], 0.0).sum(axis=1) / known.sum(axis=1)
+    known &= np.isfinite(by_spacing_per_mm2[near])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        area_mm2 = np.where(known, 1.0 / by_spacing_per_mm2[near], 0.0).sum(axis=1) / known.sum(axis=1)
+        low = ~(1.0 / area_mm2 >= required[rows] / _SLACK) | np.isnan(by_spacing_per_mm2[rows])
+    few = np.zeros_like(judged)
+    few[rows] = (counted < required[rows]) & low
+    return few
+
+
+def _next_to(strips: Strips, rows: IntArray) -> IntArray:
+    """(k, 2) points before and after some points in their lines; -1 where there is none, or the point is -1 itself."""
+    return np.where((rows >= 0)[:, None], strips.chain[rows], -1)
 
 
 def _line_ends(snapshot: MapSnapshot, strips: Strips) -> BoolArray:

@@ -14,6 +14,7 @@ from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.stations import IntArray
 
 _WINDOW = 21
+_PIECE = 100_000  # values filtered at once
 _MEDIAN_OF_NORMAL = 0.6745  # median of |standard normal|
 
 
@@ -35,7 +36,7 @@ def noise_along_lines(snapshot: MapSnapshot, order: IntArray) -> Float64Array:
     rows = np.flatnonzero(consecutive)
     if len(rows) < _WINDOW:
         return noise
-    level = median_filter(size[rows], size=_WINDOW, mode="nearest")
+    level = _running_median(size[rows])
     owner = line[rows]
     half = _WINDOW // 2
     same_line = np.zeros(len(rows), dtype=bool)
@@ -52,3 +53,14 @@ def noise_along_lines(snapshot: MapSnapshot, order: IntArray) -> Float64Array:
     for place_in_four in (0, 3, 1, 2):
         noise[order[rows[known] + place_in_four]] = level[pick[known]]
     return noise
+
+
+def _running_median(values: Float64Array) -> Float64Array:
+    """(n,) median over a window, the ends repeated; in pieces, for the filter keeps other threads from their turn."""
+    half = _WINDOW // 2
+    level = np.empty_like(values)
+    for start in range(0, len(values), _PIECE):
+        end = min(start + _PIECE, len(values))
+        first, last = max(start - half, 0), min(end + half, len(values))
+        level[start:end] = median_filter(values[first:last], size=_WINDOW, mode="nearest")[start - first : end - first]
+    return level

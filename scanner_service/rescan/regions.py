@@ -201,7 +201,7 @@ def _flanks_completed(
         beside = span[np.concatenate([high, low])]
         longest = max(2.0 * float(np.median(beside[beside > 0])) if (beside > 0).any() else 0.0, _FOOT * reach)
         upright = ribbon.overhang_mm <= UPRIGHT * reach
-        upright &= float(np.median(gap_lengths_mm(snapshot, gaps, ribbon.gaps))) <= longest
+        upright &= _half_is_within(gap_lengths_mm(snapshot, gaps, ribbon.gaps)) <= longest
         if upright and max(float(steep[high].mean()), float(steep[low].mean())) > _SHARED:
             kind[ribbon.gaps] = GapKind.FLANK
             ends = np.concatenate([high, low])
@@ -214,6 +214,13 @@ def _flanks_completed(
         ends = ends[judgement.reason[ends] == Reason.SHADOW]
         reason[ends] = Reason.SHADOW
     return shadows, replace(gaps, kind=kind), replace(judgement, reason=reason)
+
+
+def _half_is_within(lengths_mm: Float64Array) -> float:
+    """Length of the gap that holds the middle of all laid end to end: a long gap weighs as much as many short ones."""
+    rising = np.sort(lengths_mm)
+    total = np.cumsum(rising)
+    return float(rising[np.searchsorted(total, 0.5 * total[-1])])
 
 
 def _shadow_regions(ribbons: list[Ribbon], gaps: Gaps, judgement: Judgement) -> list[RescanRegion]:

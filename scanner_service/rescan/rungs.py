@@ -25,6 +25,7 @@ _LANES = 3  # a chain may miss two lanes (dropouts)
 _SLANT = 2.0  # ends this many lane widths apart still follow each other: a rim at 30° to its lanes
 _ALIKE = 0.5  # the shorter of two rungs beside each other has at least this share of the longer
 _SLIP = 1.0 / 3.0  # ... and the ends that are further apart are so by at most this share of it
+_SHORT = 6.0  # radii: longer gaps are never of the surface that leads into them
 _SAME_WAY = np.cos(np.radians(45.0))
 
 
@@ -70,8 +71,8 @@ def rungs_of(snapshot: MapSnapshot, strips: Strips, gaps: Gaps, rows: IntArray) 
         return Rungs(rows, rows, nowhere, nowhere, rows, rows, np.zeros(0), np.zeros(0), nowhere, nowhere, rows, rows)
     family = 2 * strips.group[high] + gaps.across[rows]
     # a gap whose upper end is the lower end of another in the same lane hangs below it
-    key = np.column_stack([family, gaps.lane[rows]])
-    lane = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    lanes = gaps.lane[rows] - gaps.lane[rows].min()
+    lane = np.unique(family * (int(lanes.max()) + 1) + lanes, return_inverse=True)[1].reshape(-1).astype(np.int64)
     base = len(snapshot) + 1
     by_top = np.argsort(lane * base + high, kind="stable")
     tops = (lane * base + high)[by_top]
@@ -155,7 +156,9 @@ def _nearest_pairs(rungs: Rungs) -> IntArray:
             near = near.reshape(len(mine), -1)
             pairs.append(np.column_stack([np.repeat(mine, near.shape[1]), mine[near.reshape(-1)]]))
     both = np.concatenate(pairs)
-    return np.unique(np.sort(both[both[:, 0] != both[:, 1]], axis=1), axis=0)
+    both = np.sort(both[both[:, 0] != both[:, 1]], axis=1)
+    once = np.unique(both[:, 0] * len(rungs) + both[:, 1])  # unique rows would keep other threads from their turn
+    return np.column_stack(np.divmod(once, len(rungs)))
 
 
 def walks(after: IntArray, before: IntArray) -> list[IntArray]:
@@ -194,6 +197,21 @@ def settled_kinds(snapshot: MapSnapshot, strips: Strips, gaps: Gaps) -> Gaps:
         joined = (rungs.family[short] == rungs.family[other]) & (distance <= _LANES * rungs.width_mm[short])
         joined &= np.einsum("ij,ij->i", rungs.aside[short], rungs.aside[other]) > 0
         flank[short[joined]] = flank[other[joined]]
+    # what leaves a rim along the plane of one of its ends is surface that gave no return, not yet what the rim hides
+    near = (gaps.kind[rows] == GapKind.FLANK) & _leads_on(snapshot, strips, gaps, rows, length)
     kind = gaps.kind.copy()
-    kind[rows] = np.where(flank[rungs.of_gap], GapKind.FLANK, GapKind.SHADOW)
+    kind[rows] = np.where(flank[rungs.of_gap] | near, GapKind.FLANK, GapKind.SHADOW)
     return replace(gaps, kind=kind)
+
+
+def _leads_on(snapshot: MapSnapshot, strips: Strips, gaps: Gaps, rows: IntArray, length_mm: Float64Array) -> BoolArray:
+    """(k,) True for short gaps one of whose ends has a plane that leads to the other end."""
+    high, low = gaps.high[rows], gaps.low[rows]
+    vector = snapshot.points_mm[low] - snapshot.points_mm[high]
+    off = np.fmin(
+        np.abs(np.einsum("ij,ij->i", vector, snapshot.normals[high])),
+        np.abs(np.einsum("ij,ij->i", vector, snapshot.normals[low])),
+    )
+    reach = np.maximum(strips.reach_mm[high], strips.reach_mm[low])
+    leads: BoolArray = (off <= np.maximum(0.5 * reach, 0.2 * length_mm)) & (length_mm <= _SHORT * reach)
+    return leads

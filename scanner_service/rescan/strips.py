@@ -17,6 +17,7 @@ from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.stations import IntArray, Stations
 
 _CHAIN_BREAK = 3.0  # points further apart than this many point spacings do not belong to one chain
+_LOST = 3  # places without a return that points of one surface may have between them
 _END_SLACK = 0.6  # a chain is taken to reach this many point spacings beyond its last point
 
 
@@ -138,7 +139,7 @@ def _directions(snapshot: MapSnapshot, stations: Stations, order: IntArray) -> F
 def _along_the_line(
     snapshot: MapSnapshot, order: IntArray, spacing: Float64Array, reach: Float64Array
 ) -> tuple[IntArray, Float64Array]:
-    """(n, 2) neighbours over unbroken segments; (n,) mean length of up to four of them, two on either side."""
+    """(n, 2) neighbours over unbroken segments; (n,) mean length of up to four segments, lost places counted."""
     chain = np.full((len(order), 2), -1, dtype=np.int64)
     result = np.full(len(order), np.nan)
     if len(order) < 2:
@@ -149,10 +150,14 @@ def _along_the_line(
     whole = (np.diff(line) == 0) & (length <= broken_beyond)
     chain[order[1:][whole], 0] = order[:-1][whole]
     chain[order[:-1][whole], 1] = order[1:][whole]
+    # over a few lost places the surface goes on: what did not return makes the points sparser, however steep it is
+    places = np.maximum(np.diff(snapshot.index[order]), 1)
+    as_steep = np.fmax(_CHAIN_BREAK * spacing[line[1:]] * places, reach[order[1:]])
+    spaced = (np.diff(line) == 0) & (places <= _LOST + 1) & (length <= as_steep)
     total, segments = np.zeros(len(order)), np.zeros(len(order))
-    right1 = np.append(whole, False)
+    right1 = np.append(spaced, False)
     right2 = right1 & np.append(right1[1:], False)
-    left1 = np.insert(whole, 0, False)
+    left1 = np.insert(spaced, 0, False)
     left2 = left1 & np.insert(left1[:-1], 0, False)
     step = np.append(length, 0.0)
     for has, shift in ((right1, 0), (right2, -1), (left1, 1), (left2, 2)):

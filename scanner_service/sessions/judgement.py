@@ -3,6 +3,8 @@
 Any thread may ask for a verdict. The map is read through its engine, the copy of it and the regions are owned here.
 """
 
+import contextlib
+import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -29,7 +31,8 @@ WriteEvent = Callable[[str, dict[str, Any]], None]
 class Judgement:
     """Verdicts on one session, the latest of which is in force.
 
-    `verdicts` is the engine's book of them, into which each new one is put; `write_event` takes what became of regions.
+    `verdicts` is the engine's book of them, into which each new one is put; `write_event` takes what became of regions;
+    `now_s` tells seconds.
     """
 
     def __init__(
@@ -39,12 +42,15 @@ class Judgement:
         requirement: Requirement,
         nominal: Nominal,
         write_event: WriteEvent,
+        now_s: Callable[[], float],
     ) -> None:
         self._engine = engine
         self._verdicts = verdicts
         self._requirement = requirement
         self._nominal = nominal
         self._write_event = write_event
+        self._now_s = now_s
+        self._read_s = math.nan  # when the map was read that the results are of
         self._regions = RegionBook()
         self._results: Results | None = None
         self._in_force = threading.Lock()  # of the regions and the results
@@ -54,6 +60,16 @@ class Judgement:
     def results(self) -> Results | None:
         """The latest verdict; None before the first."""
         return self._results
+
+    def age_s(self) -> float:
+        """How long ago the map was read that the latest verdict is on; NaN before the first."""
+        return self._now_s() - self._read_s
+
+    def read_map(self) -> None:
+        """Take over what changed of the map since the last reading, so that no reading holds the engine up for long."""
+        with contextlib.suppress(SessionError), self._mirroring:
+            since = self._mirror.version
+            self._mirror.keep(self._engine.ask(lambda engine: difference_since(engine.live_map, since)).result())
 
     def go_on_from(self, followed: RegionBook) -> None:
         """Follow the regions that an earlier opening left; before the first verdict only."""
@@ -68,7 +84,7 @@ class Judgement:
             if unless is not None and self._map_version() == unless:
                 return self._results
             with self._mirroring:
-                since = self._mirror.version
+                since, read_s = self._mirror.version, self._now_s()
                 change = self._engine.ask(lambda engine: difference_since(engine.live_map, since)).result()
                 snapshot = self._mirror.apply(change)
             nominal = self._nominal
@@ -92,6 +108,7 @@ class Judgement:
         with self._in_force:
             if self._results is None or snapshot.version >= self._results.snapshot.version:
                 results = self._results = self._followed(results)  # somebody may have marked a region meanwhile
+                self._read_s = read_s
         return results
 
     def mark_region(self, region_id: int, status: RegionStatus, why: str) -> None:

@@ -11,6 +11,8 @@ import numpy as np
 from scanner_service.analysis.live_map import LiveMap
 from scanner_service.analysis.snapshot import Int32Array, LineTable, MapSnapshot
 
+_MOST_KEPT = 100_000  # rows
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:
@@ -33,29 +35,50 @@ def difference_since(live_map: LiveMap, version: int) -> Difference:
 
 
 class Mirror:
-    """A copy of one live map; one thread owns it."""
+    """A copy of one live map; one thread owns it.
+
+    What changed is kept until somebody asks for the map, or until it is worth a quarter of the map: then all of it is
+    put in place at once, so that copying costs the same a point however large the map is.
+    """
 
     def __init__(self) -> None:
         self.version = 0
         self._snapshot: MapSnapshot | None = None
+        self._kept: list[Difference] = []
+
+    def keep(self, change: Difference) -> None:
+        """Take in what changed since `version`."""
+        if change.is_whole:
+            self._snapshot, self._kept = change.points, []
+        elif len(change.rows) or change.points.version != self.version:
+            self._kept.append(change)
+            if sum(len(kept.rows) for kept in self._kept) > max(_MOST_KEPT, change.total // 4):
+                self._put_in_place()
+        self.version = change.points.version
 
     def apply(self, change: Difference) -> MapSnapshot:
         """Take in what changed; the whole map as it is now, frozen. What was given before stays as it was."""
-        old = self._snapshot
-        if change.is_whole or old is None:
-            self._snapshot = change.points
-        else:
+        self.keep(change)
+        return self._put_in_place()
+
+    def _put_in_place(self) -> MapSnapshot:
+        """The map with everything that was kept."""
+        old, kept = self._snapshot, self._kept
+        if kept:
+            last = kept[-1]
             renewed = {}
             for item in fields(MapSnapshot):
-                part = getattr(change.points, item.name)
+                part = getattr(last.points, item.name)
                 if isinstance(part, LineTable) or not isinstance(part, np.ndarray) or item.name == "origin_mm":
                     renewed[item.name] = part
                     continue
-                whole = np.empty((change.total, *part.shape[1:]), dtype=part.dtype)
-                before = getattr(old, item.name)
-                whole[: len(before)] = before
-                whole[change.rows] = part
+                whole = np.empty((last.total, *part.shape[1:]), dtype=part.dtype)
+                if old is not None:
+                    before = getattr(old, item.name)
+                    whole[: len(before)] = before
+                for change in kept:
+                    whole[change.rows] = getattr(change.points, item.name)
                 renewed[item.name] = whole
-            self._snapshot = replace(change.points, **renewed)
-        self.version = self._snapshot.version
+            self._snapshot, self._kept = replace(last.points, **renewed), []
+        assert self._snapshot is not None
         return self._snapshot

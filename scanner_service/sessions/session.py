@@ -15,6 +15,7 @@ from drivers.tally import PassTally
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey
 from scanner_service.rescan.region import RegionStatus
+from scanner_service.sessions.cadence import Cadence
 from scanner_service.sessions.calibration import CALIBRATED, calibration_of
 from scanner_service.sessions.chronicle import Chronicle
 from scanner_service.sessions.engine import Engine
@@ -35,7 +36,7 @@ from scanner_service.storage.rows import SessionRow, Stored
 
 _LOG = logging.getLogger(__name__)
 ANALYSIS_PERIOD_S = 1.0
-"""Regions are looked for about this often during a scan, and less often when one search takes long."""
+"""The map is read about this often during a scan; regions are looked for as often as `Cadence` allows."""
 
 
 class LiveSession:
@@ -57,7 +58,7 @@ class LiveSession:
         self._record = record
         self._chronicle = Chronicle(record, row.session_id)
         self._judgement = Judgement(
-            self.engine, self.verdicts, self.settings.requirement(), nominal, self._chronicle.event
+            self.engine, self.verdicts, self.settings.requirement(), nominal, self._chronicle.event, clock
         )
         self._time = ScanClock(clock)
         self._state = row.state
@@ -368,6 +369,7 @@ class LiveSession:
             points=ledger.counted,
             points_per_s=ledger.counted / elapsed if elapsed > 0 else 0.0,
             coverage=results.share if results is not None else float("nan"),
+            verdict_age_s=self._judgement.age_s(),
             progress=self.source.progress(),
             losses=self.losses(),
             durable=durable,
@@ -407,21 +409,25 @@ class LiveSession:
             self._over.notify_all()
 
     def _analyse(self) -> None:
-        """The analyst's thread: a verdict about every second while the map changes."""
-        period_s = ANALYSIS_PERIOD_S
+        """The analyst's thread: reads every second what changed of the map, judges as often as its share allows."""
+        cadence = Cadence()
         seen = -1
-        while not self._closing.wait(period_s):
-            begun_s = self._time.now_s()
+        while not self._closing.wait(ANALYSIS_PERIOD_S):
+            begun_s, begun_core_s = self._time.now_s(), time.thread_time()
+            is_due = cadence.is_due(begun_s)
             try:
                 self._chronicle.watch_the_disk(self.engine.ledger, begun_s)
                 self._chronicle.ledger(self.losses(), self.elapsed_s())
-                if self._state in ("scanning", "paused") or self.results() is None:
+                if not is_due:
+                    self._judgement.read_map()
+                elif self._state in ("scanning", "paused") or self.results() is None:
                     results = self._judge(unless=seen)
                     seen = results.snapshot.version if results is not None else seen
             except Exception as error:  # noqa: BLE001 - the thread's loop: the scan goes on, and its user is told
                 _LOG.exception("session %s could not be judged", self.row.session_id)
                 self._message = f"the scan could not be judged by an internal fault: {error}"
-            period_s = max(ANALYSIS_PERIOD_S, 2.0 * (self._time.now_s() - begun_s))
+            if is_due:
+                cadence.ran(begun_s, self._time.now_s(), time.thread_time() - begun_core_s)
 
     def _judge(self, unless: int | None = None) -> Results | None:
         return self._judgement.renew(self.source, unless)

@@ -10,8 +10,8 @@ STATES = ("created", "scanning", "paused", "interrupted", "stopped", "failed")
 class Status:
     """What a session is doing, for people: counts, rates, losses and, when something is amiss, one sentence.
 
-    `lines` and `points`: stored in the record, and counted in the map. `held`: a pause that lasts until somebody
-    resumes it.
+    `lines` and `points`: stored in the record, and counted in the map. `verdict_age_s`: how long ago the map was read
+    that regions and coverage are of, NaN before the first verdict. `held`: a pause that lasts until somebody resumes.
     """
 
     session_id: str
@@ -22,6 +22,7 @@ class Status:
     points: int
     points_per_s: float
     coverage: float
+    verdict_age_s: float
     progress: float | None
     losses: dict[str, Any]
     durable: dict[str, dict[str, int]]

@@ -58,8 +58,10 @@ class VerdictBook:
         if version < self._version:
             return
         self._version = version
-        old = self.of(np.arange(len(verdict.rescan), dtype=np.int32))
-        differs = (old.rescan != verdict.rescan) | (old.reason != verdict.reason)
+        differs = verdict.rescan | (verdict.reason != 0)  # what was not judged before said nothing
+        old, both = self._verdict, min(len(differs), len(self._verdict.rescan))
+        differs[:both] = old.rescan[:both] != verdict.rescan[:both]
+        differs[:both] |= old.reason[:both] != verdict.reason[:both]
         live_map.touch(np.flatnonzero(differs).astype(np.int32))
         self._verdict = verdict
 

@@ -15,6 +15,7 @@ export function drawFigures(place, status, store, box) {
     figure("Points", whole(status?.points ?? (store.total || null))),
     figure("Rate", whole(status?.points_per_s), missing(status?.points_per_s) ? null : "points/s"),
     figure("Observed coverage", percent(status?.coverage)),
+    status?.state === "scanning" && !missing(status.verdict_age_s) ? figure("Verdict", whole(status.verdict_age_s), "s old") : "",
     figure("Extent x × y × z", size, box ? "mm" : null),
     store.skipped > 0 ? figure("Updates merged", whole(store.skipped)) : "",
   );

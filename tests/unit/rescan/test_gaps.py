@@ -1,5 +1,7 @@
 """What a triangulation scanner leaves unseen, by ray casting with both shadows, and what is made of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -102,3 +104,33 @@ def test_a_pass_that_sees_the_wall_resolves_its_shadow() -> None:
     other.laser = [laser @ turn.T + [0.0, 6.0, 0.0] for laser in other.laser]
     assert shadows(find_regions(snapshot_of(scan)))
     assert not shadows(find_regions(snapshot_of(scan.joined(other))))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_stray_returns_in_front_of_the_surface_cast_no_shadow_and_are_told_as_isolated(count: int) -> None:
+    scan = triangulated(lambda x, y: np.zeros_like(x), X, Y, 0.3)
+    for number in (9, 20, 31):
+        scan.points[number][30 : 30 + count, 2] += 4.0
+    snapshot = snapshot_of(scan)
+    report = find_regions(snapshot, geometry=GEOMETRY)
+    stray = snapshot.points_mm[:, 2] > 2.0
+    assert stray.sum() == 3 * count
+    assert not report.regions
+    assert (report.reason[stray] == Reason.ISOLATED).all()
+    assert not report.reason[~stray].any()
+
+
+def test_what_a_round_silhouette_hides_is_a_shadow_all_around_though_the_surface_grows_steep_before_it() -> None:
+    ball: Height = lambda x, y: np.where(  # noqa: E731
+        np.hypot(x, y - 6) < 4.0, 6.0 + np.sqrt(np.maximum(16.0 - x**2 - (y - 6) ** 2, 0.0)), 0.0
+    )
+    x, y = np.arange(-7.0, 7.01, 0.1), np.arange(-6.0, 14.01, 0.2)
+    snapshot = snapshot_of(triangulated(ball, x, y, 0.2))
+    report = find_regions(snapshot, geometry=replace(GEOMETRY, range_mm=(-20.0, 40.0)))
+    gaps = report.gaps
+    drop = snapshot.points_mm[gaps.high, 2] - snapshot.points_mm[gaps.low, 2]
+    long = drop > 5.0
+    assert long.sum() > 50
+    assert np.mean(gaps.kind[long] == GapKind.SHADOW) > 0.9
+    # the floor is hidden behind the ball's whole width, and so is the ball's own lower half
+    assert sum(region.area_mm2 for region in shadows(report)) > np.pi * 4.0 * 6.0

@@ -49,6 +49,27 @@ def test_the_mirror_and_the_verdict_on_it_are_those_of_the_whole_map_after_any_l
     live.close()
 
 
+def test_what_is_kept_and_put_in_place_later_makes_the_same_copy() -> None:
+    rng = np.random.default_rng(7)
+    live, mirror = LiveMap(MapSettings(noise_mm=0.002, max_points=20_000)), Mirror()
+    given: list[tuple[MapSnapshot, np.ndarray]] = []
+    for line in surface_scan(_height, lines=40, points=40, rng=rng, noise_mm=0.002):
+        live.add(line)
+        if rng.random() < 0.6:
+            mirror.keep(difference_since(live, mirror.version))
+            assert mirror.version == live.version
+        if rng.random() < 0.2:
+            mine = mirror.apply(difference_since(live, mirror.version))
+            _same(mine, live.snapshot())
+            given.append((mine, mine.neighbours.copy()))
+    live.withdraw_pass(("A", 1, 0))
+    mirror.keep(difference_since(live, mirror.version))
+    _same(mirror.apply(difference_since(live, mirror.version)), live.snapshot())
+    for snapshot, neighbours in given:  # what was given out is not written on
+        np.testing.assert_array_equal(snapshot.neighbours, neighbours)
+    live.close()
+
+
 def test_what_is_described_for_a_verdict_does_not_grow_with_the_map() -> None:
     live, mirror = LiveMap(MapSettings(noise_mm=0.002, max_points=200_000)), Mirror()
     read = []
