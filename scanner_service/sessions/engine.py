@@ -72,6 +72,11 @@ class Engine:
         self._ended = threading.Event()  # set before the inbox is emptied for the last time: see `_hand_over`
         self._thread = threading.Thread(target=self._run, name=f"engine-{session_id}", daemon=True)
 
+    @property
+    def is_pressed(self) -> bool:
+        """True while more scanlines wait than come together now and then."""
+        return self._inbox.qsize() > INBOX_LINES // 16
+
     # -- for other threads --------------------------------------------------------------------------------------
 
     def start(self) -> None:

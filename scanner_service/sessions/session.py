@@ -427,7 +427,8 @@ class LiveSession:
                 _LOG.exception("session %s could not be judged", self.row.session_id)
                 self._message = f"the scan could not be judged by an internal fault: {error}"
             if is_due:
-                cadence.ran(begun_s, self._time.now_s(), time.thread_time() - begun_core_s)
+                core_s = time.thread_time() - begun_core_s
+                cadence.ran(begun_s, self._time.now_s(), core_s, lines_wait=self.engine.is_pressed)
 
     def _judge(self, unless: int | None = None) -> Results | None:
         return self._judgement.renew(self.source, unless)
