@@ -1,6 +1,7 @@
 """From the map's records to what a reader gets: units, NaN for what is not known, derived quantities."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -52,3 +53,28 @@ def describe(
         normal_error_rad=np.where(np.isfinite(error) & (neighbours > 3), error, np.nan),
         lines=lines,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """Rows (m,) copied out of a map at one version, to be described by whoever has the time; see `describe`."""
+
+    points: PointArray
+    place: Int32Array
+    version: int
+    origin_mm: Float64Array
+    lines: LineTable
+    noise_mm: float
+    max_radius_mm: float
+
+    def describe(self) -> MapSnapshot:
+        """What the map says of them."""
+        return describe(
+            self.points,
+            version=self.version,
+            origin_mm=self.origin_mm,
+            place=self.place,
+            lines=self.lines,
+            noise_mm=self.noise_mm,
+            max_radius_mm=self.max_radius_mm,
+        )

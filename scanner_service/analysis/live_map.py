@@ -17,7 +17,7 @@ from drivers.scanline import Float64Array
 from scanner_service.analysis.ahead import Ahead
 from scanner_service.analysis.brief import Brief, brief_of
 from scanner_service.analysis.change_log import ChangeLog
-from scanner_service.analysis.describing import describe
+from scanner_service.analysis.describing import Records
 from scanner_service.analysis.errors import MapFull
 from scanner_service.analysis.flexible import flexible_radii_mm
 from scanner_service.analysis.gathering import reserve_scratch
@@ -43,7 +43,9 @@ from scanner_service.analysis.passes import Pass, PassBook, PassKey
 from scanner_service.analysis.points import (
     GROWTH_REACH,
     NOT_COUNTED,
+    POINT,
     PointArray,
+    gather_points,
     reserve_points,
     write_points,
 )
@@ -398,14 +400,20 @@ class LiveMap:
 
     def rows(self, rows: Int32Array) -> MapSnapshot:
         """The given rows as they were last evaluated; `line` still refers to the whole line table."""
-        return describe(
-            self._points[rows],
-            version=self.version,
-            origin_mm=self.origin_mm,
-            place=self._place[rows],
-            lines=self._lines.table(),
-            noise_mm=self.settings.noise_mm,
-            max_radius_mm=self._rules.max_radius_mm,
+        return self.records(rows).describe()
+
+    def records(self, rows: Int32Array) -> Records:
+        """The same, yet to be described: a fifth of the work."""
+        taken, place = np.empty(len(rows), dtype=POINT), np.empty(len(rows), dtype=np.int32)
+        gather_points(self._points, self._place, rows, taken, place)
+        return Records(
+            taken,
+            place,
+            self.version,
+            self.origin_mm,
+            self._lines.table(),
+            self.settings.noise_mm,
+            self._rules.max_radius_mm,
         )
 
     def brief(self, rows: Int32Array) -> Brief:

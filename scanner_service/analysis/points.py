@@ -93,4 +93,14 @@ def write_points(
             box_q[1, axis] = max(box_q[1, axis], xyz_q[i, axis])
 
 
+@njit(cache=True, nogil=True)
+def gather_points(
+    points: PointArray, place: Int32Array, rows: Int32Array, taken: PointArray, taken_place: Int32Array
+) -> None:
+    """Copy the rows (m,) of the table, and their places in their scanlines."""
+    for i in range(len(rows)):
+        taken[i] = points[rows[i]]
+        taken_place[i] = place[rows[i]]
+
+
 NOT_COUNTED = int(Unreliable.NOT_COUNTED)

@@ -8,19 +8,21 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
+from scanner_service.analysis.live_map import LiveMap
 from scanner_service.rescan.followed import Change, RegionBook
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionError
-from scanner_service.sessions.mirror import Mirror, difference_since
+from scanner_service.sessions.mirror import Mirror
 from scanner_service.sessions.references import Nominal
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.sources import Source
 from scanner_service.sessions.updates import VerdictBook
 
+T = TypeVar("T")
 REGIONS_CHANGED = "regions_changed"
 REGIONS_FOLLOWED = "regions_followed"
 """Events: what became of regions at one verdict; and, when a scan is over, what a later opening goes on with."""
@@ -68,8 +70,7 @@ class Judgement:
     def read_map(self) -> None:
         """Take over what changed of the map since the last reading, so that no reading holds the engine up for long."""
         with contextlib.suppress(SessionError), self._mirroring:
-            since = self._mirror.version
-            self._mirror.keep(self._engine.ask(lambda engine: difference_since(engine.live_map, since)).result())
+            self._mirror.catch_up(self._ask, self._ask_between)
 
     def go_on_from(self, followed: RegionBook) -> None:
         """Follow the regions that an earlier opening left; before the first verdict only."""
@@ -84,9 +85,9 @@ class Judgement:
             if unless is not None and self._map_version() == unless:
                 return self._results
             with self._mirroring:
-                since, read_s = self._mirror.version, self._now_s()
-                change = self._engine.ask(lambda engine: difference_since(engine.live_map, since)).result()
-                snapshot = self._mirror.apply(change)
+                read_s = self._now_s()
+                self._mirror.catch_up(self._ask, self._ask_between)
+                snapshot = self._mirror.snapshot()
             nominal = self._nominal
             found = judge(
                 snapshot,
@@ -141,4 +142,10 @@ class Judgement:
             self._write_event(REGIONS_CHANGED, {"changes": [change.to_dict() for change in changes]})
 
     def _map_version(self) -> int:
-        return self._engine.ask(lambda engine: engine.live_map.read_version()).result()
+        return self._ask(lambda live_map: live_map.read_version())
+
+    def _ask(self, question: Callable[[LiveMap], T]) -> T:
+        return self._engine.ask(lambda engine: question(engine.live_map)).result()
+
+    def _ask_between(self, question: Callable[[LiveMap], T]) -> T:
+        return self._engine.ask_between(lambda engine: question(engine.live_map)).result()
