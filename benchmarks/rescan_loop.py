@@ -20,9 +20,10 @@ from scanner_service.rescan.passes.looks import look_of
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.optics import ScannerOptics
 from scanner_service.rescan.passes.outcome import Outcome, reckon, trust_of
-from scanner_service.rescan.passes.planner import Tried, Wishes, plan_passes
+from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.passes.reach import Reach
 from scanner_service.rescan.passes.recommendation import Plan
+from scanner_service.rescan.passes.tried import Tried
 from scanner_service.rescan.regions import RegionReport, find_regions
 from scanner_service.rescan.requirement import Requirement
 from simulators.meshes import load_mesh

@@ -15,6 +15,8 @@ from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.looks import Look, mark_empty
 from scanner_service.rescan.passes.marching import SURFACE, carve, fill_pockets, gather, open_faces, outward
 from scanner_service.rescan.passes.optics import ScannerOptics
+from scanner_service.rescan.passes.solid import set_nominal
+from scanner_service.rescan.reference import Pieces
 
 IntArray = npt.NDArray[np.int64]
 MAX_CELLS = 6_000_000
@@ -70,6 +72,7 @@ def know_surface(
     cell_mm: float | None = None,
     looks: tuple[Look, ...] = (),
     optics: ScannerOptics | None = None,
+    nominal: Pieces | None = None,
 ) -> KnownSurface:
     """The surface a map knows.
 
@@ -80,6 +83,8 @@ def know_surface(
     region : (n,) number of the region of a failing point, 0 for none.
     cell_mm : side of a cell; None: wide enough for the map's line spacing and for at most MAX_CELLS cells.
     looks, optics : passes whose poses are known, and the scanner's: what they looked into in vain is not hidden.
+    nominal : the nominal part, where there is one: what lies outside of it is not hidden, and its surface stands in the
+        way.
     """
     use = snapshot.neighbours > 0
     points = snapshot.points_mm
@@ -108,6 +113,8 @@ def know_surface(
     normals = _normals(sums[:, 3:6], state, low, side, places, lines.laser_mm)
     # so many cells does a plane of this slope cut through on a square of one cell
     area = side * side / np.maximum(np.abs(normals).sum(axis=1), 1.0)
+    if nominal is not None:
+        set_nominal(state, low, side, nominal)
     open_cells, gradient = _frontier(state)
     if looks and optics is not None and mark_empty(state, low, side, looks, optics, open_cells, gradient):
         open_cells, gradient = _frontier(state)

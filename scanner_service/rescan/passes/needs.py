@@ -1,7 +1,10 @@
 """What is still wanted of a surface: places whose scanning would be a gain, and what each belongs to; knows no rig."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,11 +13,19 @@ from scipy.spatial import cKDTree
 from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.gaps import GapKind
+from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.known_surface import IntArray, KnownSurface
 from scanner_service.rescan.passes.marching import FREE
+from scanner_service.rescan.passes.nominal import Missing
+from scanner_service.rescan.passes.serving import number_of
+from scanner_service.rescan.region import RescanRegion
 from scanner_service.rescan.regions import RegionReport
+from scanner_service.rescan.requirement import Requirement
 
 _OTHER_SIDE = -0.5  # cosine between normals beyond which two places are the two sides of a wall
+_ANOTHER = 0.7  # a noisy place is looked at from at most this share of the angle at which it was noisy
+_HEAD_ON_RAD = math.radians(20.0)  # ... and nearer to the normal than this no direction is better
+_OUTNUMBER = 1.25
 UNSEEN = 0
 """The region number of surface that no point has touched, and that no region has found."""
 
@@ -33,7 +44,8 @@ class Needs:
     """Places (n, 3) to be scanned, part frame, with unit normals (n, 3) and the area (n,) each stands for.
 
     `region` (n,) is the number of the region they belong to (UNSEEN: none), `evidence` (n,) why they are believed in,
-    `density_per_mm2` (n,) what a pass must bring there, `chance` (n,) how likely they are what they seem.
+    `chance` (n,) how likely they are what they seem. What a pass must bring there: `density_per_mm2` (n,), lines at
+    most `spacing_mm` (n,) apart on the surface, and rays at most `incidence_rad` (n,) from the normal.
     """
 
     places_mm: Float64Array
@@ -43,6 +55,8 @@ class Needs:
     evidence: IntArray
     density_per_mm2: Float64Array
     chance: Float64Array
+    spacing_mm: Float64Array
+    incidence_rad: Float64Array
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -57,43 +71,107 @@ class Needs:
         gain: Float64Array = self.area_mm2 * self.chance
         return gain
 
+    @classmethod
+    def plain(
+        cls, places_mm: Float64Array, normals: Float64Array, area_mm2: Float64Array, density_per_mm2: float = 1.0
+    ) -> "Needs":
+        """Surface of no region that asks for a density and nothing else."""
+        n = len(area_mm2)
+        none = np.zeros(n, dtype=np.int64)
+        density, chance = np.full(n, density_per_mm2), np.ones(n)
+        far, wide = np.full(n, np.inf), np.full(n, 0.5 * np.pi)
+        return cls(places_mm, normals, area_mm2, none, none.copy(), density, chance, far, wide)
+
+    def changed(self, **columns: npt.NDArray[Any]) -> "Needs":
+        """With other values in some columns."""
+        return Needs(**{name: columns.get(name, getattr(self, name)) for name in self.__slots__})
+
     def only(self, keep: BoolArray) -> "Needs":
         """Some of them."""
         return Needs(*(getattr(self, name)[keep] for name in self.__slots__))
 
 
-def failing_points(report: RegionReport) -> tuple[BoolArray, npt.NDArray[np.int32]]:
-    """(n,) which points fail, and the number of the region each belongs to (0: none)."""
+def failing_points(
+    report: RegionReport, regions: Sequence[RescanRegion] | None = None
+) -> tuple[BoolArray, npt.NDArray[np.int32]]:
+    """(n,) which points fail, and the number of the region each belongs to (0: none).
+
+    `regions` are those of the report as they are followed; None: as they are in the report.
+    """
     region = np.zeros(len(report.reason), dtype=np.int32)
-    for listed in report.regions:
-        region[listed.point_rows] = listed.number
+    for listed in report.regions if regions is None else regions:
+        region[listed.point_rows[listed.point_rows < len(region)]] = number_of(listed)
     return report.judgement.fails, region
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What surface must get: a density, and where it is asked for a line spacing on it and an incidence.
+
+    `by_judgement`: where points were judged, the line spacing that the judgement allows there counts (chord error).
+    """
+
+    density_per_mm2: float
+    line_spacing_mm: float = math.inf
+    incidence_rad: float = 0.5 * math.pi
+    by_judgement: bool = False
+
+    @classmethod
+    def of(cls, density_per_mm2: float, requirement: Requirement | None) -> "Wanted":
+        """What a requirement asks for, at a density that is known already."""
+        if requirement is None:
+            return cls(density_per_mm2)
+        spacing, incidence = requirement.line_spacing_mm, requirement.incidence_rad
+        return cls(
+            density_per_mm2,
+            math.inf if spacing is None else spacing,
+            0.5 * math.pi if incidence is None else incidence,
+            spacing is not None or requirement.chord_error_mm is not None,
+        )
 
 
 def find_needs(
     snapshot: MapSnapshot,
     report: RegionReport,
     surface: KnownSurface,
-    required_per_mm2: float,
+    wanted: Wanted,
     chances: dict[Evidence, float] | None = None,
     explore: bool = True,
+    regions: Sequence[RescanRegion] | None = None,
+    missing: Missing | None = None,
 ) -> Needs:
     """Collect what is wanted.
 
     Parameters
     ----------
-    required_per_mm2 : density that a pass must bring to a place to be a gain.
+    wanted : what a pass must bring to a place to be a gain.
     chances : how likely each kind of evidence has proved; 1 for what is not named.
     explore : whether surface is reckoned with where hidden space begins, outside of any region.
+    regions : the regions as they are followed; None: as they are in the report.
+    missing : surface of the nominal part that no point has touched; with it nothing is guessed.
     """
-    parts = [_measured(surface), _floors(snapshot, report, surface)]
-    if explore:
+    regions = report.regions if regions is None else regions
+    parts = [_measured(surface), _floors(snapshot, report, surface, regions)]
+    if missing is not None:
+        parts.append(_missing(missing))
+    elif explore:
         parts += [_frontier(surface), _backs(surface)]
     places, normals, area, region, evidence = (np.concatenate(column) for column in zip(*parts, strict=True))
     keep = _apart(surface, places, normals, evidence)
+    places, normals, area, region, evidence = (
+        column[keep] for column in (places, normals, area, region, evidence)
+    )  # fmt: skip
+    bare = _bare(regions, set(region.tolist()))
+    places, normals, area, region, evidence = (
+        np.concatenate(pair) for pair in zip((places, normals, area, region, evidence), bare, strict=True)
+    )
+    n = len(area)
     chance = np.array([(chances or {}).get(kind, 1.0) for kind in Evidence])[evidence]
-    needs = Needs(places, normals, area, region, evidence, np.full(len(area), required_per_mm2), chance)
-    return needs.only(keep)
+    needs = Needs(
+        places, normals, area, region, evidence, np.full(n, wanted.density_per_mm2), chance,
+        np.full(n, wanted.line_spacing_mm), np.full(n, wanted.incidence_rad),
+    )  # fmt: skip
+    return _as_judged(snapshot, report, surface, needs, wanted)
 
 
 Columns = tuple[Float64Array, Float64Array, Float64Array, IntArray, IntArray]
@@ -106,7 +184,9 @@ def _measured(surface: KnownSurface) -> Columns:
     return surface.points_mm[rows], surface.normals[rows], surface.area_mm2[rows], surface.region[rows], kind
 
 
-def _floors(snapshot: MapSnapshot, report: RegionReport, surface: KnownSurface) -> Columns:
+def _floors(
+    snapshot: MapSnapshot, report: RegionReport, surface: KnownSurface, regions: Sequence[RescanRegion]
+) -> Columns:
     """Along each shadow the far surface goes on to below the near end: from `low` within its plane to under `high`."""
     gaps = report.gaps
     rows = np.flatnonzero(np.isin(gaps.kind, (GapKind.SHADOW, GapKind.FLANK)))
@@ -125,9 +205,7 @@ def _floors(snapshot: MapSnapshot, report: RegionReport, surface: KnownSurface) 
     share = steps[None, :] * surface.cell_mm / np.maximum(length[:, None], 1e-9)
     which, step = np.nonzero(usable[:, None] & (share < 1.0))
     places = start[which] + share[which, step][:, None] * (foot - start)[which]
-    region = np.zeros(len(snapshot), dtype=np.int64)
-    for listed in report.regions:
-        region[listed.point_rows] = listed.number
+    region = failing_points(report, regions)[1].astype(np.int64)
     number = np.maximum(region[high], region[low])[which]
     keys, first = np.unique(surface.keys(places), return_index=True)
     taken = surface.state.reshape(-1)[keys] == 3
@@ -157,6 +235,63 @@ def _backs(surface: KnownSurface) -> Columns:
     kind = np.full(len(rows), Evidence.FRONTIER, dtype=np.int64)
     none = np.full(len(rows), UNSEEN, dtype=np.int64)
     return surface.points_mm[rows], -surface.normals[rows], surface.area_mm2[rows], none, kind
+
+
+def _missing(missing: Missing) -> Columns:
+    """Surface of the nominal part that no point has touched."""
+    kind = np.full(len(missing.area_mm2), Evidence.REFERENCE, dtype=np.int64)
+    return missing.places_mm, missing.normals, missing.area_mm2, missing.region, kind
+
+
+def _bare(regions: Sequence[RescanRegion], served: set[int]) -> Columns:
+    """Regions of whose surface nothing else tells, each as one place, so that none is left without a word."""
+    bare = [
+        region
+        for region in regions
+        if number_of(region) not in served
+        and region.reason is not Reason.ISOLATED
+        and region.area_mm2 > 0
+        and np.isfinite(region.normal).all()
+        and np.isfinite(region.centroid_mm).all()
+    ]
+    return (
+        np.array([region.centroid_mm for region in bare]).reshape(-1, 3),
+        np.array([region.normal for region in bare]).reshape(-1, 3),
+        np.array([region.area_mm2 for region in bare], dtype=np.float64),
+        np.array([number_of(region) for region in bare], dtype=np.int64),
+        np.full(len(bare), Evidence.FLOOR, dtype=np.int64),
+    )
+
+
+def _as_judged(
+    snapshot: MapSnapshot, report: RegionReport, surface: KnownSurface, needs: Needs, wanted: Wanted
+) -> Needs:
+    """What each measured place asks for by the verdict on its own points: line spacing by chord, another direction."""
+    measured = np.flatnonzero(needs.evidence == Evidence.MEASURED)
+    noisy = report.reason == Reason.NOISY
+    if not len(measured) or not (wanted.by_judgement or noisy.any()):
+        return needs
+    spacing, incidence, density = (
+        column.copy() for column in (needs.spacing_mm, needs.incidence_rad, needs.density_per_mm2)
+    )
+    order = np.argsort(surface.keys(needs.places_mm[measured]), kind="stable")
+    keys = surface.keys(needs.places_mm[measured])[order]
+    rows = np.flatnonzero(report.judgement.fails)
+    at = np.searchsorted(keys, surface.keys(snapshot.points_mm[rows]))
+    at = np.minimum(at, len(keys) - 1)
+    mine = keys[at] == surface.keys(snapshot.points_mm[rows])
+    rows, need = rows[mine], measured[order][at[mine]]
+    if wanted.by_judgement:
+        np.fmin.at(spacing, need, report.judgement.allowed_mm[rows])
+    loud = noisy[rows]
+    ray = snapshot.lines.laser_mm[snapshot.line[rows[loud]]] - snapshot.points_mm[rows[loud]]
+    cosine = np.abs(np.einsum("ij,ij->i", ray, snapshot.normals[rows[loud]])) / np.linalg.norm(ray, axis=1)
+    seen_at = np.where(np.isfinite(cosine), np.arccos(np.minimum(cosine, 1.0)), 0.0)
+    np.fmin.at(incidence, need[loud], np.maximum(_ANOTHER * seen_at, _HEAD_ON_RAD))
+    # the old points stay: good ones must outnumber them
+    count = np.bincount(need[loud], minlength=len(needs)).astype(np.float64)
+    density = np.maximum(density, _OUTNUMBER * count / np.maximum(needs.area_mm2, 1e-9))
+    return needs.changed(spacing_mm=spacing, incidence_rad=incidence, density_per_mm2=density)
 
 
 def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, evidence: IntArray) -> BoolArray:

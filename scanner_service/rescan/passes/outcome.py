@@ -1,7 +1,8 @@
 """What a pass promised against what it brought, region by region; plans nothing."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -61,6 +62,24 @@ class Outcome:
             "reached_mm2": self.reached_mm2,
             "regions": [one.to_dict() for one in self.regions],
         }
+
+    @classmethod
+    def from_dict(cls, kept: Mapping[str, Any]) -> "Outcome":
+        """As `to_dict` told it, with the places of `missed_mm` where they are there too.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError : it was not told so.
+        """
+        regions = tuple(
+            RegionOutcome(
+                UNSEEN if one["region"] is None else int(one["region"]),
+                float(one["promised_mm2"]),
+                float(one["reached_mm2"]),
+            )
+            for one in kept["regions"]
+        )
+        return cls(regions, np.array(kept.get("missed_mm", ()), dtype=np.float64).reshape(-1, 3))
 
 
 def reckon(

@@ -1,7 +1,8 @@
 """One recommended pass as it is told: where, how, how long, what for and with what result to expect; plans none."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -143,12 +144,16 @@ class Plan:
     """Recommended passes of one version of the map, the best for its time first, and what none of them can bring.
 
     `needed_mm2` is all that is still wanted, `promised_mm2` what the listed passes are to bring of it.
+    `reachable_regions` are those of which some pose sees something; `lost_regions` those of which nothing can be
+    brought, with the reason.
     """
 
     version: int
     passes: tuple[RecommendedPass, ...]
     unreachable: tuple[Unreachable, ...]
     needed_mm2: float
+    reachable_regions: frozenset[int] = frozenset()
+    lost_regions: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def promised_mm2(self) -> float:

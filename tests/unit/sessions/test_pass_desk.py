@@ -7,8 +7,10 @@ import pytest
 
 from scanner_service.rescan.passes.errors import RigUnlimited
 from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.closed_loop import LoopLimits
 from scanner_service.sessions.errors import PassUnknown, SessionBusy
-from scanner_service.sessions.pass_desk import LoopLimits, PassStatus, RigSetup
+from scanner_service.sessions.pass_orders import PassStatus
+from scanner_service.sessions.rig_setups import RigSetup
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
 from scanner_service.storage.record import Record
@@ -60,7 +62,7 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
     guidance = desk.guidance(order.order_id)
     assert guidance.aside_mm < 0.5 and guidance.along_mm < 1.0
     session.stop()
-    desk._wait_for(order)
+    desk.wait_for(order)
     assert order.status is PassStatus.DONE
     assert order.outcome.promised_mm2 == pytest.approx(one.gain_mm2)
     assert order.outcome.reached_mm2 > 0.7 * order.outcome.promised_mm2
@@ -69,7 +71,7 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
     for _ in range(100):
         if "pass_outcome" in kinds(book, session):
             break
-        desk._wait_for(order)
+        desk.wait_for(order)
     told = [kind for kind in kinds(book, session) if kind.startswith("pass_")]
     assert told == ["pass_accepted", "pass_started", "pass_outcome"]
 
@@ -102,7 +104,7 @@ def test_a_part_that_must_be_turned_waits_for_its_operator(book, scanned):
     with pytest.raises(SessionBusy, match="running"):
         desk.carry_out(order.order_id, part_is_turned=True)
     session.stop()
-    desk._wait_for(order)
+    desk.wait_for(order)
 
 
 def test_a_hand_cannot_be_looped(book, scanned):

@@ -8,7 +8,8 @@ from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.looks import look_of
 from scanner_service.rescan.passes.marching import FREE, HIDDEN
 from scanner_service.rescan.passes.outcome import reckon
-from scanner_service.rescan.passes.planner import TRIES, Tried, Wishes, plan_passes
+from scanner_service.rescan.passes.planner import Wishes, plan_passes
+from scanner_service.rescan.passes.tried import TRIES, Tried
 from simulators.parts import plate, sphere, step
 from tests.unit.rescan.passes.posed_scans import (
     DENSITY,
