@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from drivers.scanline import Pose
+from scanner_service.rescan.passes.experience import chances_of, trust_of
 from scanner_service.rescan.passes.guidance import Guidance, guide
 from scanner_service.rescan.passes.looks import Look, look_of
 from scanner_service.rescan.passes.motion import StraightMotion
-from scanner_service.rescan.passes.outcome import reckon, trust_of
+from scanner_service.rescan.passes.outcome import Outcome, reckon
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.passes.recommendation import Plan
 from scanner_service.rescan.passes.serving import EVERYTHING, Serving, number_of
@@ -230,7 +231,14 @@ class PassDesk:
         required = results.requirement.density_per_mm2
         if required is None:
             required = float(np.nanmedian(results.report.judgement.required_per_mm2)) if len(results.snapshot) else 1.0
-        wishes = Wishes(required, trust=self._trust(), requirement=results.requirement, serving=serving)
+        earlier = self._outcomes()
+        wishes = Wishes(
+            required,
+            chances=chances_of(earlier),
+            trust=trust_of(earlier),
+            requirement=results.requirement,
+            serving=serving,
+        )
         return plan_passes(
             results.snapshot,
             results.report,
@@ -260,10 +268,10 @@ class PassDesk:
             except SessionError as error:  # it was mended meanwhile
                 _LOG.info("region %d was not marked: %s", region.region_id, error)
 
-    def _trust(self) -> float:
-        """How much of what this session's passes promised was reached."""
-        done = [(one.outcome, one.planned.trust) for one in self._orders.all() if one.status is PassStatus.DONE]
-        return trust_of([(out.promised_mm2, out.reached_mm2, trust) for out, trust in done if out is not None])
+    def _outcomes(self) -> list[Outcome]:
+        """What became of the passes that were carried out, the oldest first."""
+        done = [one.outcome for one in self._orders.all() if one.status is PassStatus.DONE]
+        return [outcome for outcome in done if outcome is not None]
 
     def _looks(self, results: Results, setup: RigSetup) -> tuple[Look, ...]:
         """The passes whose poses are known: those that were ordered, and the session's own."""

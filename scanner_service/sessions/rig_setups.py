@@ -197,8 +197,6 @@ def _description_of(session: LiveSession, rigs: Path | None) -> RigDescription:
 
 def _rig_opener(session: LiveSession, wanted: RecommendedPass, rigs: Path | None) -> Callable[[], Source]:
     known = description = _description_of(session, rigs)
-    if not is_driven(session):
-        raise SessionBusy("nothing moves the stage of this rig: scan the pass by hand into a session of pushed lines")
     turn = wanted.turn
     if isinstance(wanted.motion, StraightMotion) and turn is not None and not turn.is_none:
         # the part lies otherwise on the stage; seen from the part the whole rig has turned the other way

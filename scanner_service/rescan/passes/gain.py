@@ -14,8 +14,11 @@ from scanner_service.rescan.passes.visibility import both_see
 
 SLACK = 1.05
 """Lines are planned this much closer than they may be: normals are estimates."""
-MARGIN = 1.15
-"""The density aimed at is this much above the one required: normals are estimates, and some rays are lost by chance."""
+MARGIN = 1.25
+"""The density aimed at is this much above the one required: normals are estimates, some rays are lost by chance, and
+points do not lie evenly."""
+SERVED = 1.1
+"""What gets this much more than is required counts as served."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,13 +12,17 @@ from scanner_service.rescan.passes.motion import Motion, StraightMotion, Turning
 from scanner_service.rescan.passes.reach import PartTurn
 from scanner_service.rescan.passes.recommendation import Promise, RecommendedPass, pose_dict
 
-_COLUMNS = 8  # a place (3), where it faces (3), its area and its region
+_COLUMNS = 10  # a place (3), where it faces (3), what is promised of it, its area, its region, its evidence
 _MOST_PLACES = 20_000
 
 
 def keep_pass(one: RecommendedPass) -> dict[str, Any]:
     """Everything of a pass as JSON; the places it serves as base64 of float32 rows."""
-    rows = np.column_stack([one.places_mm, one.place_normals, one.place_mm2, one.place_regions])
+    rows = np.column_stack(
+        [
+            one.places_mm, one.place_normals, one.place_mm2, one.place_area_mm2, one.place_regions, one.place_evidence,
+        ]
+    )  # fmt: skip
     return {
         "number": one.number,
         "motion": keep_motion(one.motion),
@@ -34,6 +38,7 @@ def keep_pass(one: RecommendedPass) -> dict[str, Any]:
         ],
         "places": base64.b64encode(rows.astype("<f4").tobytes()).decode("ascii"),
         "turn": None if one.turn is None else [one.turn.about_vertical_rad, one.turn.tip_rad],
+        "chances": list(one.chances),
         "trust": one.trust,
     }
 
@@ -58,7 +63,7 @@ def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
             "start_mm", "end_mm", "line_spacing_mm", "line_rate_hz", "duration_s", "approach_s", "trust",
         )
     }  # fmt: skip
-    turn = kept["turn"]
+    turn, (a, b, c, d) = kept["turn"], map(float, kept["chances"])
     return RecommendedPass(
         number=int(kept["number"]),
         motion=kept_motion(kept["motion"]),
@@ -66,8 +71,11 @@ def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
         places_mm=rows[:, :3].copy(),
         place_normals=rows[:, 3:6].copy(),
         place_mm2=rows[:, 6].copy(),
-        place_regions=rows[:, 7].copy(),
+        place_area_mm2=rows[:, 7].copy(),
+        place_regions=rows[:, 8].copy(),
+        place_evidence=rows[:, 9].copy(),
         turn=None if turn is None else PartTurn(float(turn[0]), float(turn[1])),
+        chances=(a, b, c, d),
         **numbers,
     )
 

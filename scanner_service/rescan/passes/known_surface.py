@@ -21,7 +21,7 @@ from scanner_service.rescan.reference import Pieces
 IntArray = npt.NDArray[np.int64]
 MAX_CELLS = 6_000_000
 MAX_OPEN = 200_000
-LEAST_CELL_MM = 0.5
+LEAST_CELL_MM = 0.35
 _LINES_IN_A_CELL = 1.3  # so that a surface at the coarsest line spacing leaves no cell empty
 _ONE_SIDED = 0.6  # length of the mean normal below which the normals of a cell point both ways
 _MARGIN_MM = 1.5  # how far beyond the outermost points hidden surface is reckoned with: the next pass sees further

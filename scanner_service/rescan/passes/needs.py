@@ -39,6 +39,12 @@ class Evidence(IntEnum):
     REFERENCE = 3  # the nominal part says so
 
 
+Chances = tuple[float, float, float, float]
+"""How likely a place is what it seems, by `Evidence`."""
+FIRST_CHANCES: Chances = (1.0, 0.9, 0.8, 0.9)
+"""... before a pass has shown it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Needs:
     """Places (n, 3) to be scanned, part frame, with unit normals (n, 3) and the area (n,) each stands for.
@@ -135,7 +141,7 @@ def find_needs(
     report: RegionReport,
     surface: KnownSurface,
     wanted: Wanted,
-    chances: dict[Evidence, float] | None = None,
+    chances: Chances = FIRST_CHANCES,
     explore: bool = True,
     regions: Sequence[RescanRegion] | None = None,
     missing: Missing | None = None,
@@ -145,7 +151,7 @@ def find_needs(
     Parameters
     ----------
     wanted : what a pass must bring to a place to be a gain.
-    chances : how likely each kind of evidence has proved; 1 for what is not named.
+    chances : how likely each kind of evidence has proved.
     explore : whether surface is reckoned with where hidden space begins, outside of any region.
     regions : the regions as they are followed; None: as they are in the report.
     missing : surface of the nominal part that no point has touched; with it nothing is guessed.
@@ -166,7 +172,7 @@ def find_needs(
         np.concatenate(pair) for pair in zip((places, normals, area, region, evidence), bare, strict=True)
     )
     n = len(area)
-    chance = np.array([(chances or {}).get(kind, 1.0) for kind in Evidence])[evidence]
+    chance = np.array(chances)[evidence]
     needs = Needs(
         places, normals, area, region, evidence, np.full(n, wanted.density_per_mm2), chance,
         np.full(n, wanted.line_spacing_mm), np.full(n, wanted.incidence_rad),

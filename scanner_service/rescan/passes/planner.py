@@ -10,7 +10,15 @@ from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.cover import Choice, Cover
 from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.looks import Look
-from scanner_service.rescan.passes.needs import UNSEEN, Evidence, Needs, Wanted, failing_points, find_needs
+from scanner_service.rescan.passes.needs import (
+    FIRST_CHANCES,
+    UNSEEN,
+    Chances,
+    Needs,
+    Wanted,
+    failing_points,
+    find_needs,
+)
 from scanner_service.rescan.passes.nominal import missing_of
 from scanner_service.rescan.passes.optics import ScannerOptics
 from scanner_service.rescan.passes.reach import Reach
@@ -34,15 +42,15 @@ class Wishes:
 
     `requirement` asks for more than a density: line spacing, chord error, incidence. `serving` names what is to be
     served; unseen surface only when nothing is named. `explore` reckons with surface where hidden space begins,
-    outside of any region. `chances` are how likely each kind of evidence has proved, `trust` is how much of what
-    earlier passes promised was reached (`outcome.trust_of`).
+    outside of any region. `chances` are how likely each kind of evidence has proved (`experience.chances_of`), `trust`
+    how much good surface there was for each mm² that was there as foretold (`experience.trust_of`).
     """
 
     density_per_mm2: float
     max_passes: int = 6
     least_gain_mm2: float = 2.0
     explore: bool = True
-    chances: tuple[float, float, float, float] = (1.0, 1.0, 0.9, 1.0)
+    chances: Chances = FIRST_CHANCES
     cell_mm: float | None = None
     trust: float = 1.0
     requirement: Requirement | None = None
@@ -77,11 +85,11 @@ def plan_passes(
     fails, region = failing_points(report, regions)
     pieces = None if reference is None else reference.pieces
     surface = know_surface(snapshot, fails, region, wishes.cell_mm, looks, optics, pieces)
-    chances = {kind: wishes.trust * chance for kind, chance in zip(Evidence, wishes.chances, strict=True)}
     missing = None if reference is None else missing_of(reference, regions)
     wanted = Wanted.of(wishes.density_per_mm2, wishes.requirement)
     explore = wishes.explore and wishes.serving.is_everything
-    needs = find_needs(snapshot, report, surface, wanted, chances, explore, regions, missing)
+    needs = find_needs(snapshot, report, surface, wanted, wishes.chances, explore, regions, missing)
+    needs = needs.changed(chance=wishes.trust * needs.chance)
     if not wishes.serving.is_everything:
         named = [number_of(one) for one in regions if wishes.serving.wants(one)]
         needs = needs.only(np.isin(needs.region, named))
@@ -94,7 +102,7 @@ def plan_passes(
         choice = cover.next(standing)
         if choice is None or choice.stretch.gain_mm2 < wishes.least_gain_mm2:
             break
-        one = _recommend(len(passes) + 1, choice, needs, reach, standing, wishes.trust)
+        one = _recommend(len(passes) + 1, choice, needs, reach, standing, wishes)
         passes.append(one)
         standing = one.end_pose
     lost = unreachable(needs, cover.reachable, cover.attitudes, sky, optics) + in_vain(given_up, needs)
@@ -114,7 +122,7 @@ def _thinned(needs: Needs) -> Needs:
 
 
 def _recommend(
-    number: int, choice: Choice, needs: Needs, reach: Reach, standing: Pose | None, trust: float
+    number: int, choice: Choice, needs: Needs, reach: Reach, standing: Pose | None, wishes: Wishes
 ) -> RecommendedPass:
     stretch, prospect, served = choice.stretch, choice.prospect, choice.served
     spacing = stretch.line_spacing_mm
@@ -146,7 +154,10 @@ def _recommend(
         places_mm=needs.places_mm[served],
         place_regions=needs.region[served].astype(np.float64),
         place_mm2=needs.gain_mm2[served],
+        place_area_mm2=needs.area_mm2[served],
+        place_evidence=needs.evidence[served].astype(np.float64),
         place_normals=needs.normals[served],
         turn=choice.attitude.turn,
-        trust=trust,
+        chances=wishes.chances,
+        trust=wishes.trust,
     )

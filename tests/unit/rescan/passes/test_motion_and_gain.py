@@ -173,10 +173,8 @@ def test_optics_that_cannot_be_meant_are_refused():
 
 
 def wanted_pass():
-    nothing = np.zeros((0, 3))
-    return RecommendedPass(
-        1, FROM_ABOVE, 0.0, 40.0, 0.2, 50.0, 4.0, 0.0, (), nothing, np.zeros(0), np.zeros(0), nothing.copy()
-    )  # fmt: skip
+    nothing, none = np.zeros((0, 3)), (np.zeros(0) for _ in range(4))
+    return RecommendedPass(1, FROM_ABOVE, 0.0, 40.0, 0.2, 50.0, 4.0, 0.0, (), nothing, *none, nothing.copy())
 
 
 @pytest.mark.parametrize(
