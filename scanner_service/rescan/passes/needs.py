@@ -23,6 +23,8 @@ from scanner_service.rescan.regions import RegionReport
 from scanner_service.rescan.requirement import Requirement
 
 _OTHER_SIDE = -0.5  # cosine between normals beyond which two places are the two sides of a wall
+_THROUGH = 2.8  # cells: how thick a wall may be of which one side is told by the other
+_AROUND = 24
 _ANOTHER = 0.7  # a noisy place is looked at from at most this share of the angle at which it was noisy
 _HEAD_ON_RAD = math.radians(20.0)  # ... and nearer to the normal than this no direction is better
 _OUTNUMBER = 1.25
@@ -234,7 +236,7 @@ def _backs(surface: KnownSurface) -> Columns:
     """The other side of walls thinner than a cell: seen from one side only, and known to be free behind."""
     rows = np.flatnonzero(~surface.two_sided & (surface.failing_share < 0.5))
     alone = np.ones(len(rows), dtype=np.bool_)
-    for cells in (2.0, 2.8):
+    for cells in (2.0, _THROUGH):
         behind = surface.points_mm[rows] - cells * surface.cell_mm * surface.normals[rows]
         alone &= surface.state.reshape(-1)[surface.keys(behind)] == FREE
     rows = rows[alone]
@@ -305,10 +307,15 @@ def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, e
     keep = np.ones(len(places), dtype=np.bool_)
     guessed = np.flatnonzero(evidence != Evidence.MEASURED)
     if len(guessed) and len(surface.points_mm):
-        near, which = cKDTree(surface.points_mm).query(places[guessed], distance_upper_bound=1.2 * surface.cell_mm)
+        bound = _THROUGH * surface.cell_mm
+        near, which = cKDTree(surface.points_mm).query(places[guessed], k=_AROUND, distance_upper_bound=bound)
         met = np.minimum(which, len(surface.points_mm) - 1)
-        facing = np.einsum("ij,ij->i", surface.normals[met], normals[guessed])
-        keep[guessed] = ~np.isfinite(near) | ((facing < _OTHER_SIDE) & ~surface.two_sided[met])
+        facing = np.einsum("ikj,ij->ik", surface.normals[met], normals[guessed])
+        is_near = near[:, 0] <= 1.2 * surface.cell_mm
+        other_side = (facing[:, 0] < _OTHER_SIDE) & ~surface.two_sided[met[:, 0]]
+        # the other side of a thin wall may be measured in the cells behind those of this one
+        seen = (np.isfinite(near) & (facing > -_OTHER_SIDE)).any(axis=1)
+        keep[guessed] = ~is_near | (other_side & ~seen)
     floors = np.flatnonzero((evidence == Evidence.FLOOR) & keep)
     frontier = np.flatnonzero((evidence == Evidence.FRONTIER) & keep)
     if len(floors) and len(frontier):
