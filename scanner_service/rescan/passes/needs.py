@@ -25,6 +25,7 @@ from scanner_service.rescan.requirement import Requirement
 _OTHER_SIDE = -0.5  # cosine between normals beyond which two places are the two sides of a wall
 _THROUGH = 2.8  # cells: how thick a wall may be of which one side is told by the other
 _AROUND = 24
+_SURE = 0.6  # share of solid cells around from which on hidden space is taken to begin with surface
 _ANOTHER = 0.7  # a noisy place is looked at from at most this share of the angle at which it was noisy
 _HEAD_ON_RAD = math.radians(20.0)  # ... and nearer to the normal than this no direction is better
 _OUTNUMBER = 1.25
@@ -164,17 +165,15 @@ def find_needs(
         parts.append(_missing(missing))
     elif explore:
         parts += [_frontier(surface), _backs(surface)]
-    places, normals, area, region, evidence = (np.concatenate(column) for column in zip(*parts, strict=True))
+    places, normals, area, region, evidence, sure = (np.concatenate(column) for column in zip(*parts, strict=True))
     keep = _apart(surface, places, normals, evidence)
-    places, normals, area, region, evidence = (
-        column[keep] for column in (places, normals, area, region, evidence)
+    found = tuple(column[keep] for column in (places, normals, area, region, evidence, sure))
+    bare = _bare(regions, set(found[3].tolist()))
+    places, normals, area, region, evidence, sure = (
+        np.concatenate(pair) for pair in zip(found, bare, strict=True)
     )  # fmt: skip
-    bare = _bare(regions, set(region.tolist()))
-    places, normals, area, region, evidence = (
-        np.concatenate(pair) for pair in zip((places, normals, area, region, evidence), bare, strict=True)
-    )
     n = len(area)
-    chance = np.array(chances)[evidence]
+    chance = np.array(chances)[evidence] * sure
     needs = Needs(
         places, normals, area, region, evidence, np.full(n, wanted.density_per_mm2), chance,
         np.full(n, wanted.line_spacing_mm), np.full(n, wanted.incidence_rad),
@@ -182,14 +181,22 @@ def find_needs(
     return _as_judged(snapshot, report, surface, needs, wanted)
 
 
-Columns = tuple[Float64Array, Float64Array, Float64Array, IntArray, IntArray]
+Columns = tuple[Float64Array, Float64Array, Float64Array, IntArray, IntArray, Float64Array]
+"""Places, normals, area, region, evidence, and how much nearer to certain each is than its kind (at most 1)."""
 
 
 def _measured(surface: KnownSurface) -> Columns:
     """Cells most of whose points fail."""
     rows = np.flatnonzero(surface.failing_share >= 0.5)
     kind = np.full(len(rows), Evidence.MEASURED, dtype=np.int64)
-    return surface.points_mm[rows], surface.normals[rows], surface.area_mm2[rows], surface.region[rows], kind
+    return (
+        surface.points_mm[rows],
+        surface.normals[rows],
+        surface.area_mm2[rows],
+        surface.region[rows],
+        kind,
+        np.ones(len(rows)),
+    )
 
 
 def _floors(
@@ -221,15 +228,16 @@ def _floors(
     across = np.abs(normal[which[first]])
     area = surface.cell_mm**2 / np.maximum(across.sum(axis=1), 1.0)
     kind = np.full(len(first), Evidence.FLOOR, dtype=np.int64)
-    return places[first], normal[which[first]], area, number[first], kind
+    return places[first], normal[which[first]], area, number[first], kind, np.ones(len(first))
 
 
 def _frontier(surface: KnownSurface) -> Columns:
-    """Where hidden space begins; it belongs to no region."""
+    """Where hidden space begins; it belongs to no region. Edges and thin rests of it are rarely surface."""
     n = len(surface.frontier_mm2)
+    sure = np.minimum(1.0, surface.frontier_solid / _SURE) ** 2
     kind = np.full(n, Evidence.FRONTIER, dtype=np.int64)
     none = np.full(n, UNSEEN, dtype=np.int64)
-    return surface.frontier_mm, surface.frontier_normals, surface.frontier_mm2, none, kind
+    return surface.frontier_mm, surface.frontier_normals, surface.frontier_mm2, none, kind, sure
 
 
 def _backs(surface: KnownSurface) -> Columns:
@@ -242,13 +250,13 @@ def _backs(surface: KnownSurface) -> Columns:
     rows = rows[alone]
     kind = np.full(len(rows), Evidence.FRONTIER, dtype=np.int64)
     none = np.full(len(rows), UNSEEN, dtype=np.int64)
-    return surface.points_mm[rows], -surface.normals[rows], surface.area_mm2[rows], none, kind
+    return surface.points_mm[rows], -surface.normals[rows], surface.area_mm2[rows], none, kind, np.ones(len(rows))
 
 
 def _missing(missing: Missing) -> Columns:
     """Surface of the nominal part that no point has touched."""
     kind = np.full(len(missing.area_mm2), Evidence.REFERENCE, dtype=np.int64)
-    return missing.places_mm, missing.normals, missing.area_mm2, missing.region, kind
+    return missing.places_mm, missing.normals, missing.area_mm2, missing.region, kind, np.ones(len(missing.area_mm2))
 
 
 def _bare(regions: Sequence[RescanRegion], served: set[int]) -> Columns:
@@ -268,6 +276,7 @@ def _bare(regions: Sequence[RescanRegion], served: set[int]) -> Columns:
         np.array([region.area_mm2 for region in bare], dtype=np.float64),
         np.array([number_of(region) for region in bare], dtype=np.int64),
         np.full(len(bare), Evidence.FLOOR, dtype=np.int64),
+        np.ones(len(bare)),
     )
 
 
@@ -308,7 +317,8 @@ def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, e
     guessed = np.flatnonzero(evidence != Evidence.MEASURED)
     if len(guessed) and len(surface.points_mm):
         bound = _THROUGH * surface.cell_mm
-        near, which = cKDTree(surface.points_mm).query(places[guessed], k=_AROUND, distance_upper_bound=bound)
+        found = cKDTree(surface.points_mm).query(places[guessed], k=_AROUND, distance_upper_bound=bound)
+        near, which = np.asarray(found[0]), np.asarray(found[1])
         met = np.minimum(which, len(surface.points_mm) - 1)
         facing = np.einsum("ikj,ij->ik", surface.normals[met], normals[guessed])
         is_near = near[:, 0] <= 1.2 * surface.cell_mm
