@@ -12,7 +12,7 @@ _FADING = 0.6  # what a pass taught weighs this much less after each further one
 _RECENT = 3
 _TRUST = (0.6, 1.6)
 _LEAST_MM2 = 10.0  # less surface than this says little
-_LEAST_CHANCE = 0.05
+_CHANCE = (0.05, 1.6)  # above 1 where edges of hidden space proved better than they are counted
 
 
 def chances_of(earlier: Sequence[Outcome]) -> Chances:
@@ -27,7 +27,7 @@ def chances_of(earlier: Sequence[Outcome]) -> Chances:
         for one in outcome.kinds:
             asked[one.evidence] += _FADING**age * one.asked_mm2
             kept[one.evidence] += _FADING**age * one.kept_mm2
-    a, b, c, d = np.clip(kept / asked, _LEAST_CHANCE, 1.0).tolist()
+    a, b, c, d = np.clip(kept / asked, *_CHANCE).tolist()
     return a, b, c, d
 
 

@@ -43,8 +43,8 @@ class Evidence(IntEnum):
 
 
 Chances = tuple[float, float, float, float]
-"""How likely a place is what it seems, by `Evidence`."""
-FIRST_CHANCES: Chances = (1.0, 0.9, 0.8, 0.9)
+"""How likely a place is what it seems, by `Evidence`; of hidden space before its edges are counted for less."""
+FIRST_CHANCES: Chances = (1.0, 0.9, 1.2, 0.9)
 """... before a pass has shown it."""
 
 
@@ -173,7 +173,7 @@ def find_needs(
         np.concatenate(pair) for pair in zip(found, bare, strict=True)
     )  # fmt: skip
     n = len(area)
-    chance = np.array(chances)[evidence] * sure
+    chance = np.minimum(np.array(chances)[evidence] * sure, 1.0)
     needs = Needs(
         places, normals, area, region, evidence, np.full(n, wanted.density_per_mm2), chance,
         np.full(n, wanted.line_spacing_mm), np.full(n, wanted.incidence_rad),
@@ -312,7 +312,7 @@ def _as_judged(
 
 
 def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, evidence: IntArray) -> BoolArray:
-    """False for guesses that stand on what is known already: measured surface, or a better guess."""
+    """False for guesses that stand on what is known already: measured surface, free space, or a better guess."""
     keep = np.ones(len(places), dtype=np.bool_)
     guessed = np.flatnonzero(evidence != Evidence.MEASURED)
     if len(guessed) and len(surface.points_mm):
@@ -326,9 +326,17 @@ def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, e
         # the other side of a thin wall may be measured in the cells behind those of this one
         seen = (np.isfinite(near) & (facing > -_OTHER_SIDE)).any(axis=1)
         keep[guessed] = ~is_near | (other_side & ~seen)
+    keep[_in_the_air(surface, places, normals) & (evidence == Evidence.FLOOR)] = False
     floors = np.flatnonzero((evidence == Evidence.FLOOR) & keep)
     frontier = np.flatnonzero((evidence == Evidence.FRONTIER) & keep)
     if len(floors) and len(frontier):
         near, _ = cKDTree(places[floors]).query(places[frontier], distance_upper_bound=surface.cell_mm)
         keep[frontier] = ~np.isfinite(near)
     return keep
+
+
+def _in_the_air(surface: KnownSurface, places: Float64Array, normals: Float64Array) -> BoolArray:
+    """(n,) True for places that rays went through, and a cell below them too."""
+    state = surface.state.reshape(-1)
+    below = places - surface.cell_mm * normals
+    return np.asarray((state[surface.keys(places)] == FREE) & (state[surface.keys(below)] == FREE))

@@ -36,7 +36,11 @@ class RegionOutcome:
 
 @dataclass(frozen=True, slots=True)
 class KindOutcome:
-    """What became of the places of one kind of evidence: area that was asked for, and what of it is good."""
+    """What became of the places of one kind of evidence.
+
+    `asked_mm2` is the area that was asked for, edges of hidden space counted for less; `kept_mm2` the whole area of the
+    places that are good now.
+    """
 
     evidence: Evidence
     asked_mm2: float
@@ -153,13 +157,13 @@ def reckon(
 
 
 def _kinds(done: RecommendedPass, kept: BoolArray) -> tuple[KindOutcome, ...]:
-    """By kind of evidence, what was asked for before the chances of that kind came in, and what of it is good."""
+    """By kind of evidence, what was asked for before the chances of that kind came in, and the area that is good."""
     found = []
     for kind in Evidence:
         mine = done.place_evidence == kind
         if mine.any():
             asked = done.place_mm2 / (done.trust * done.chances[kind])
-            found.append(KindOutcome(kind, float(asked[mine].sum()), float(asked[mine & kept].sum())))
+            found.append(KindOutcome(kind, float(asked[mine].sum()), float(done.place_area_mm2[mine & kept].sum())))
     return tuple(found)
 
 
