@@ -318,13 +318,13 @@ def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, e
     if len(guessed) and len(surface.points_mm):
         bound = _THROUGH * surface.cell_mm
         found = cKDTree(surface.points_mm).query(places[guessed], k=_AROUND, distance_upper_bound=bound)
-        near, which = np.asarray(found[0]), np.asarray(found[1])
+        away, which = np.asarray(found[0]), np.asarray(found[1])
         met = np.minimum(which, len(surface.points_mm) - 1)
         facing = np.einsum("ikj,ij->ik", surface.normals[met], normals[guessed])
-        is_near = near[:, 0] <= 1.2 * surface.cell_mm
+        is_near = away[:, 0] <= 1.2 * surface.cell_mm
         other_side = (facing[:, 0] < _OTHER_SIDE) & ~surface.two_sided[met[:, 0]]
         # the other side of a thin wall may be measured in the cells behind those of this one
-        seen = (np.isfinite(near) & (facing > -_OTHER_SIDE)).any(axis=1)
+        seen = (np.isfinite(away) & (facing > -_OTHER_SIDE)).any(axis=1)
         keep[guessed] = ~is_near | (other_side & ~seen)
     keep[_in_the_air(surface, places, normals) & (evidence == Evidence.FLOOR)] = False
     floors = np.flatnonzero((evidence == Evidence.FLOOR) & keep)
