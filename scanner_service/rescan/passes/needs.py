@@ -25,6 +25,7 @@ from scanner_service.rescan.requirement import Requirement
 _OTHER_SIDE = -0.5  # cosine between normals beyond which two places are the two sides of a wall
 _THROUGH = 2.8  # cells: how thick a wall may be of which one side is told by the other
 _AROUND = 24
+_BARE = 0.25  # a region is rarely a square around its middle
 _SURE = 0.6  # share of solid cells around from which on hidden space is taken to begin with surface
 _ANOTHER = 0.7  # a noisy place is looked at from at most this share of the angle at which it was noisy
 _HEAD_ON_RAD = math.radians(20.0)  # ... and nearer to the normal than this no direction is better
@@ -276,7 +277,7 @@ def _bare(regions: Sequence[RescanRegion], served: set[int]) -> Columns:
         np.array([region.area_mm2 for region in bare], dtype=np.float64),
         np.array([number_of(region) for region in bare], dtype=np.int64),
         np.full(len(bare), Evidence.FLOOR, dtype=np.int64),
-        np.ones(len(bare)),
+        np.full(len(bare), _BARE),
     )
 
 

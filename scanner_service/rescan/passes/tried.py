@@ -10,7 +10,7 @@ from scanner_service.rescan.passes.needs import Needs
 
 TRIES = 3
 """So often a place is promised before it is given up."""
-LOWERED = 0.4
+LOWERED = 0.25
 """What a pass in vain leaves of the chance that a place is what it seems."""
 
 
