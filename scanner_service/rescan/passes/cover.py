@@ -105,7 +105,7 @@ class Cover:
         laser = attitude.rotation @ (geometry.laser_mm / np.linalg.norm(geometry.laser_mm))
         camera = attitude.rotation @ (geometry.camera_mm / np.linalg.norm(geometry.camera_mm))
         seen: BoolArray = (
-            (needs.normals @ laser >= math.cos(self._optics.max_incidence_rad))
+            (needs.normals @ laser >= np.cos(np.minimum(self._optics.max_incidence_rad, needs.incidence_rad)))
             & (needs.normals @ camera >= math.cos(self._optics.max_camera_rad))
             & self._sky.along(laser)
             & self._sky.along(camera)
