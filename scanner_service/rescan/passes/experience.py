@@ -8,7 +8,7 @@ from scanner_service.rescan.passes.needs import FIRST_CHANCES, Chances, Evidence
 from scanner_service.rescan.passes.outcome import Outcome
 
 _BELIEF_MM2 = 40.0  # the first chances weigh as much as this area
-_FADING = 0.6  # what a pass taught weighs this much less after each further one
+_FADING = 0.6  # what a pass taught of a kind weighs this much less after each further one that had places of it
 _RECENT = 3
 _TRUST = (0.6, 1.6)
 _LEAST_MM2 = 10.0  # less surface than this says little
@@ -23,12 +23,13 @@ def chances_of(earlier: Sequence[Outcome]) -> Chances:
     """
     asked = np.full(len(Evidence), _BELIEF_MM2)
     kept = _BELIEF_MM2 * np.array(FIRST_CHANCES)
-    for age, outcome in enumerate(reversed(earlier)):
+    weight = np.ones(len(Evidence))
+    for outcome in reversed(earlier):
         for one in outcome.kinds:
-            asked[one.evidence] += _FADING**age * one.asked_mm2
-            kept[one.evidence] += _FADING**age * one.kept_mm2
-    a, b, c, d = np.clip(kept / asked, *_CHANCE).tolist()
-    return a, b, c, d
+            asked[one.evidence] += weight[one.evidence] * one.asked_mm2
+            kept[one.evidence] += weight[one.evidence] * one.kept_mm2
+            weight[one.evidence] *= _FADING
+    return tuple(np.clip(kept / asked, *_CHANCE).tolist())
 
 
 def trust_of(earlier: Sequence[Outcome]) -> float:

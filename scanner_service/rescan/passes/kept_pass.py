@@ -9,6 +9,7 @@ import numpy as np
 
 from drivers.scanline import Float64Array, Pose
 from scanner_service.rescan.passes.motion import Motion, StraightMotion, TurningMotion
+from scanner_service.rescan.passes.needs import Evidence
 from scanner_service.rescan.passes.reach import PartTurn
 from scanner_service.rescan.passes.recommendation import Promise, RecommendedPass, pose_dict
 
@@ -63,7 +64,9 @@ def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
             "start_mm", "end_mm", "line_spacing_mm", "line_rate_hz", "duration_s", "approach_s", "trust",
         )
     }  # fmt: skip
-    turn, (a, b, c, d) = kept["turn"], map(float, kept["chances"])
+    turn, chances = kept["turn"], tuple(map(float, kept["chances"]))
+    if len(chances) != len(Evidence):
+        raise ValueError(f"a kept pass has {len(chances)} chances, and there are {len(Evidence)} kinds of evidence")
     return RecommendedPass(
         number=int(kept["number"]),
         motion=kept_motion(kept["motion"]),
@@ -75,7 +78,7 @@ def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
         place_regions=rows[:, 8].copy(),
         place_evidence=rows[:, 9].copy(),
         turn=None if turn is None else PartTurn(float(turn[0]), float(turn[1])),
-        chances=(a, b, c, d),
+        chances=chances,
         **numbers,
     )
 

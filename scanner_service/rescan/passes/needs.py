@@ -41,11 +41,12 @@ class Evidence(IntEnum):
     FLOOR = 1  # behind a jump in range the far surface goes on
     FRONTIER = 2  # hidden space begins here
     REFERENCE = 3  # the nominal part says so
+    BEYOND = 4  # hidden space goes on beyond the outermost points
 
 
-Chances = tuple[float, float, float, float]
+Chances = tuple[float, ...]
 """How likely a place is what it seems, by `Evidence`; of hidden space before its edges are counted for less."""
-FIRST_CHANCES: Chances = (1.0, 0.9, 1.2, 0.9)
+FIRST_CHANCES: Chances = (1.0, 0.9, 1.2, 0.9, 1.2)
 """... before a pass has shown it."""
 
 
@@ -237,6 +238,10 @@ def _frontier(surface: KnownSurface) -> Columns:
     n = len(surface.frontier_mm2)
     sure = np.minimum(1.0, surface.frontier_solid / _SURE) ** 2
     kind = np.full(n, Evidence.FRONTIER, dtype=np.int64)
+    if len(surface.points_mm):
+        low, high = surface.points_mm.min(axis=0), surface.points_mm.max(axis=0)
+        off = np.maximum(low - surface.frontier_mm, surface.frontier_mm - high).max(axis=1)
+        kind[off > 0.5 * surface.cell_mm] = Evidence.BEYOND
     none = np.full(n, UNSEEN, dtype=np.int64)
     return surface.frontier_mm, surface.frontier_normals, surface.frontier_mm2, none, kind, sure
 
@@ -329,7 +334,7 @@ def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, e
         keep[guessed] = ~is_near | (other_side & ~seen)
     keep[_in_the_air(surface, places, normals) & (evidence == Evidence.FLOOR)] = False
     floors = np.flatnonzero((evidence == Evidence.FLOOR) & keep)
-    frontier = np.flatnonzero((evidence == Evidence.FRONTIER) & keep)
+    frontier = np.flatnonzero(np.isin(evidence, (Evidence.FRONTIER, Evidence.BEYOND)) & keep)
     if len(floors) and len(frontier):
         near, _ = cKDTree(places[floors]).query(places[frontier], distance_upper_bound=surface.cell_mm)
         keep[frontier] = ~np.isfinite(near)

@@ -69,6 +69,9 @@ def test_each_kind_of_evidence_is_believed_as_far_as_it_proved_true():
     assert learned[Evidence.FRONTIER] < 0.25
     assert learned[Evidence.MEASURED] == FIRST_CHANCES[Evidence.MEASURED]
     assert chances_of([became(400.0, 0.0, 0.0), became(400.0, 400.0, 400.0)])[Evidence.FRONTIER] > 0.55
+    beyond = became(400.0, 0.0, 0.0, Evidence.BEYOND)
+    later = [became(100.0, 100.0, 100.0)] * 5  # passes that had no such places teach nothing of them
+    assert chances_of([beyond, *later])[Evidence.BEYOND] == chances_of([beyond])[Evidence.BEYOND] < 0.2
     assert chances_of([became(1e6, 0.0, 0.0)])[Evidence.FRONTIER] == 0.05  # nothing is ruled out for good
 
 
