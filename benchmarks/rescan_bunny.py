@@ -66,11 +66,7 @@ def compare(folder: Path, max_incidence_rad: float = np.radians(65.0)) -> dict[s
     snapshot = live_map.snapshot()
     none = np.zeros(len(snapshot), dtype=np.bool_)
     surface = know_surface(snapshot, none, np.zeros(len(snapshot), dtype=np.int32), 1.2)
-    n = len(surface.points_mm)
-    flat = np.zeros(n, dtype=np.int64)
-    places = Needs(
-        surface.points_mm, surface.normals, surface.area_mm2, flat, flat.copy(), np.ones(n), np.ones(n)
-    )  # fmt: skip
+    places = Needs.plain(surface.points_mm, surface.normals, surface.area_mm2)
     laser = np.array([-(LASER_MM[0] - MIDDLE_MM), 0.0, LASER_MM[1]])
     geometry = SensorGeometry(laser, laser.copy(), (-200.0, 200.0), 0.1)
     optics = ScannerOptics(geometry, 400.0, 400, max_incidence_rad=max_incidence_rad, max_camera_rad=np.radians(89.0))

@@ -16,13 +16,15 @@ from drivers.scanline import Float64Array, Pose, Scanline
 from scanner_service.analysis.intake import quantise
 from scanner_service.analysis.live_map import LiveMap, MapSettings
 from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.rescan.passes.experience import chances_of, trust_of
 from scanner_service.rescan.passes.looks import look_of
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.optics import ScannerOptics
-from scanner_service.rescan.passes.outcome import Outcome, reckon, trust_of
-from scanner_service.rescan.passes.planner import Tried, Wishes, plan_passes
+from scanner_service.rescan.passes.outcome import Outcome, reckon
+from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.passes.reach import Reach
-from scanner_service.rescan.passes.recommendation import Plan
+from scanner_service.rescan.passes.recommendation import Plan, RecommendedPass
+from scanner_service.rescan.passes.tried import Tried
 from scanner_service.rescan.regions import RegionReport, find_regions
 from scanner_service.rescan.requirement import Requirement
 from simulators.meshes import load_mesh
@@ -275,12 +277,12 @@ def closed_loop(
     scan.run.way = "closed loop"
     first_pass(scan, subject, scanner)
     optics = ScannerOptics(scanner.geometry(), scanner.field_of_view_mm, scanner.points_per_line)
-    earlier: list[tuple[float, float, float]] = []
+    earlier: list[Outcome] = []
     tried = Tried.nothing()
     snapshot, report = judged(scan, scanner)
     plan: Plan | None = None
     for _ in range(MAX_PASSES):
-        wishes = Wishes(DENSITY_PER_MM2, max_passes=1, trust=trust_of(earlier))
+        wishes = Wishes(DENSITY_PER_MM2, max_passes=1, chances=chances_of(earlier), trust=trust_of(earlier))
         begun = time.perf_counter()
         looks = [look_of(snapshot, n, *one, scanner.points_per_line) for n, one in enumerate(scan.looks)]
         seen = tuple(look for look in looks if look is not None)
@@ -295,19 +297,24 @@ def closed_loop(
         snapshot, report = judged(scan, scanner)
         outcome: Outcome = reckon(chosen, was, was_report, snapshot, report, wishes.cell_mm)
         tried = tried.and_also(outcome.missed_mm)
-        earlier.append((outcome.promised_mm2, outcome.reached_mm2, wishes.trust))
+        earlier.append(outcome)
         scan.run.promised_mm2.append(outcome.promised_mm2)
         scan.run.reached_mm2.append(outcome.reached_mm2)
         scan.run.true_gain_mm2.append(scan.truth.met_mm2 - before)
-        tell(
-            f"  pass {len(scan.run.seconds)}: {scan.run.seconds[-1]:.1f} s, {scan.run.coverage[-1]:.2%}, promised "
-            f"{outcome.promised_mm2:.0f}, reached {outcome.reached_mm2:.0f}, truth {scan.run.true_gain_mm2[-1]:.0f}"
-            " mm2, "
-            f"tilt {math.degrees(reach.tilt_rad(chosen.start_pose.rotation)):.0f}, "
-            f"spacing {chosen.line_spacing_mm:.3f}, "
-            f"needed {plan.needed_mm2:.0f}, planned in {scan.run.planning_s[-1]:.2f} s"
-        )
+        tell(_told(scan, chosen, outcome, plan, reach))
     return scan.run, scan, plan
+
+
+def _told(scan: Scan, chosen: RecommendedPass, outcome: Outcome, plan: Plan, reach: Reach) -> str:
+    run = scan.run
+    kinds = ", ".join(f"{one.evidence.name.lower()} {one.kept_mm2:.0f}/{one.asked_mm2:.0f}" for one in outcome.kinds)
+    return (
+        f"  pass {len(run.seconds)}: {run.seconds[-1]:.1f} s, {run.coverage[-1]:.2%}, promised "
+        f"{outcome.promised_mm2:.0f}, reached {outcome.reached_mm2:.0f} and {outcome.besides_mm2:.0f} besides "
+        f"({kinds}), truth {run.true_gain_mm2[-1]:.0f} mm2, "
+        f"tilt {math.degrees(reach.tilt_rad(chosen.start_pose.rotation)):.0f}, spacing {chosen.line_spacing_mm:.3f}, "
+        f"needed {plan.needed_mm2:.0f}, planned in {run.planning_s[-1]:.2f} s"
+    )
 
 
 def promise_errors(run: Run) -> Float64Array:

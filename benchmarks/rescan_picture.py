@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.rescan_loop import DENSITY_PER_MM2, Scan, Subject, first_pass, judged, reach_of
 from drivers.scanline import Float64Array
 from scanner_service.rescan.passes.known_surface import know_surface
-from scanner_service.rescan.passes.needs import Evidence, failing_points, find_needs
+from scanner_service.rescan.passes.needs import Evidence, Wanted, failing_points, find_needs
 from scanner_service.rescan.passes.optics import ScannerOptics
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from simulators.optics import demo_scanner
@@ -39,7 +39,7 @@ def draw(path: Path) -> None:
     snapshot, report = judged(scan, scanner)
     optics = ScannerOptics(scanner.geometry(), scanner.field_of_view_mm, scanner.points_per_line)
     surface = know_surface(snapshot, *failing_points(report))
-    needs = find_needs(snapshot, report, surface, DENSITY_PER_MM2)
+    needs = find_needs(snapshot, report, surface, Wanted(DENSITY_PER_MM2))
     first = plan_passes(snapshot, report, reach, optics, Wishes(DENSITY_PER_MM2, 1)).passes[0]
     figure = plt.figure(figsize=(9.0, 6.0), layout="constrained")
     axes = figure.add_subplot(projection="3d")

@@ -20,7 +20,6 @@ from scanner_service.sessions.results import judge
 from scanner_service.sessions.updates import VerdictBook
 from simulators.optics import demo_scanner
 
-
 T = TypeVar("T")
 
 

@@ -64,7 +64,9 @@ class Solid(ABC):
             before[index] = (enter < at) & (at <= leave)
             after[index] = (enter <= at) & (at < leave)
         enters = self.combine(iter(after))
-        crossing = (self.combine(iter(before)) != enters) & (at > 0)
+        # a leaf that the ray misses has no ends, though the ends of its faces may lie where another leaf's are
+        met = np.repeat(ends[live, 0] < ends[live, 1], 2, axis=0)
+        crossing = (self.combine(iter(before)) != enters) & (at > 0) & met
         candidates = np.where(crossing, at, np.inf)
         nearest = candidates.argmin(axis=0)
         rays = np.arange(n)

@@ -9,9 +9,12 @@ from pydantic import Field
 from drivers.rig_limits import AxisKind, RigLimits
 from drivers.scanline import SensorGeometry
 from scanner_service.api.schemas import Finite, Strict, Vector
+from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.errors import RigUnlimited
 from scanner_service.rescan.passes.reach import Reach
-from scanner_service.sessions.pass_desk import LoopLimits, RigSetup, optics_stated
+from scanner_service.rescan.passes.serving import Serving
+from scanner_service.sessions.closed_loop import LoopLimits
+from scanner_service.sessions.rig_setups import RigSetup, optics_stated
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -29,7 +32,10 @@ class ScannerIn(Strict):
 
 
 class RigIn(Strict):
-    """What a rig can do: a linear axis between two ends, or a sensor that is held in any pose within a box."""
+    """What a rig can do: a linear axis between two ends, or a sensor that is held in any pose within a box.
+
+    `driven_by_client`: a client carries out what is accepted, by itself, so that the closed loop may run.
+    """
 
     axis: Literal["linear", "free_pose"]
     scanner: ScannerIn
@@ -41,6 +47,7 @@ class RigIn(Strict):
     speed_mm_per_s: Positive = 50.0
     line_spacing_mm: tuple[Positive, Positive] = (0.05, 1.0)
     part_may_turn: bool = True
+    driven_by_client: bool = False
 
     def to_setup(self) -> RigSetup:
         """As the pass desk takes it; raises PlanningError or ValueError when it cannot be meant."""
@@ -75,7 +82,7 @@ class RigIn(Strict):
         stated = optics_stated(
             geometry, optics.field_of_view_mm, optics.points_per_line, math.radians(optics.max_incidence_deg)
         )
-        return RigSetup(reach, stated)
+        return RigSetup(reach, stated, driven_by_client=self.driven_by_client)
 
 
 class CarryOutIn(Strict):
@@ -84,13 +91,25 @@ class CarryOutIn(Strict):
     part_is_turned: bool = False
 
 
+ReasonName = Literal["steep", "sparse", "shadow", "out_of_range", "lost_lines", "noisy", "untouched"]
+RegionId = Annotated[int, Field(ge=1)]
+
+
+def serving_of(regions: list[int], reasons: list[ReasonName]) -> Serving:
+    """What is to be served; nothing named: everything."""
+    return Serving(frozenset(regions), frozenset(Reason[name.upper()] for name in reasons))
+
+
 class LoopIn(Strict):
-    """When a closed loop ends at the latest."""
+    """When a closed loop ends at the latest, and what it serves: regions by id, and by reason."""
 
     max_passes: Annotated[int, Field(ge=1, le=200)] = 20
     max_seconds: Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)] = 600.0
     coverage_share: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] | None = None
+    regions: Annotated[list[RegionId], Field(max_length=1000)] = Field(default_factory=list)
+    reasons: Annotated[list[ReasonName], Field(max_length=10)] = Field(default_factory=list)
 
     def to_limits(self) -> LoopLimits:
         """As the pass desk takes them."""
-        return LoopLimits(self.max_passes, self.max_seconds, self.coverage_share)
+        serving = serving_of(self.regions, self.reasons)
+        return LoopLimits(self.max_passes, self.max_seconds, self.coverage_share, serving)

@@ -64,7 +64,7 @@ class Service:
         replay_dir.mkdir(exist_ok=True)
         record = Record.open(record_at or data_dir / "record.sqlite", limits=limits)
         try:
-            book = SessionBook(record, retention, meshes=replay_dir)
+            book = SessionBook(record, retention, meshes=replay_dir, rigs=data_dir / "rigs")
             access = Access.open(data_dir, time.monotonic, secrets.token_bytes)
             exports = ExportDesk(
                 data_dir / "exports",

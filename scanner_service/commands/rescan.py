@@ -1,6 +1,7 @@
 """`scanner rescan`: recommended passes of a session of a running service: list, carry out, or the whole closed loop."""
 
 import time
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import httpx
@@ -11,7 +12,9 @@ from scanner_service.api.keys import read_local_key
 from scanner_service.commands.serve import DEFAULT_DATA, Data
 from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json
 
+Serving = dict[str, Sequence[str | int | float | bool | None]]
 _POLL_S = 0.3
+_OVER = ("done", "failed", "cancelled")
 
 
 def rescan_command(
@@ -19,6 +22,9 @@ def rescan_command(
     carry_out: Annotated[int | None, typer.Option("--pass", help="Carry out this pass of the list.")] = None,
     turned: Annotated[bool, typer.Option("--turned", help="The part lies as the pass asks.")] = False,
     auto: Annotated[bool, typer.Option("--auto", help="Repeat until nothing is left to do.")] = False,
+    cancel: Annotated[int | None, typer.Option("--cancel", help="Give up this accepted order.")] = None,
+    region: Annotated[list[int] | None, typer.Option("--region", min=1, help="Serve this region; repeatable.")] = None,
+    reason: Annotated[list[str] | None, typer.Option("--reason", help="Serve this reason; repeatable.")] = None,
     max_passes: Annotated[int, typer.Option(min=1, max=200, help="Most passes of --auto.")] = 20,
     max_seconds: Annotated[float, typer.Option(min=1.0, help="Most seconds of passes of --auto.")] = 600.0,
     data: Data = DEFAULT_DATA,
@@ -30,23 +36,28 @@ def rescan_command(
         key = read_local_key(data)
         if key is None:
             fail(f"there is no key in {data}: start `scanner serve` first, or name its folder with --data")
-        if auto and carry_out is not None:
-            fail("say either --pass or --auto")
+        if sum((auto, carry_out is not None, cancel is not None)) > 1:
+            fail("say one of --pass, --auto and --cancel")
+        serving: Serving = {"region": region or [], "reason": reason or []}
         head = {"Authorization": f"Bearer {key}"}
         with httpx.Client(base_url=url, headers=head, timeout=120.0) as client:
             where = f"/api/v1/sessions/{_session_id(client, session)}"
             if auto:
-                result = _loop(client, where, {"max_passes": max_passes, "max_seconds": max_seconds}, as_json)
+                limits = {"max_passes": max_passes, "max_seconds": max_seconds}
+                named = {"regions": serving["region"], "reasons": serving["reason"]}
+                result = _loop(client, where, limits | named, as_json)
             elif carry_out is not None:
-                result = _one(client, where, carry_out, turned)
+                result = _one(client, where, carry_out, turned, serving)
+            elif cancel is not None:
+                result = _ask(client.delete(f"{where}/pass-orders/{cancel}"))
             else:
-                result = _ask(client.get(f"{where}/recommended-passes"))
+                result = _ask(client.get(f"{where}/recommended-passes", params=serving))
         if as_json:
             show_json(result)
         elif auto:
             _tell_orders(result["orders"])
             console.print(f"The loop ended: {result['loop']['why_ended']}.", highlight=False, soft_wrap=True)
-        elif carry_out is not None:
+        elif carry_out is not None or cancel is not None:
             _tell_orders([result])
         else:
             _tell_plan(result)
@@ -69,7 +80,7 @@ def _loop(client: httpx.Client, where: str, limits: dict[str, Any], quiet: bool)
     while True:
         loop = _ask(client.get(f"{where}/rescan"))["loop"]
         orders = _ask(client.get(f"{where}/pass-orders"))["orders"]
-        while told < len(orders) and orders[told]["status"] in ("done", "failed"):
+        while told < len(orders) and orders[told]["status"] in _OVER:
             if not quiet:
                 errors.print(_said(orders[told]), highlight=False)
             told += 1
@@ -78,16 +89,19 @@ def _loop(client: httpx.Client, where: str, limits: dict[str, Any], quiet: bool)
         time.sleep(_POLL_S)
 
 
-def _one(client: httpx.Client, where: str, number: int, turned: bool) -> dict[str, Any]:
-    """Accept a pass, carry it out and wait for its end; a hand is guided meanwhile."""
-    order = _ask(client.post(f"{where}/recommended-passes/{number}/accept"))
+def _one(client: httpx.Client, where: str, number: int, turned: bool, serving: Serving) -> dict[str, Any]:
+    """Accept a pass, carry it out and wait for its end; a hand is guided meanwhile. A refused one leaves no order."""
+    order = _ask(client.post(f"{where}/recommended-passes/{number}/accept", params=serving))
     mine = f"{where}/pass-orders/{order['order']}"
-    _ask(client.post(f"{mine}/carry-out", json={"part_is_turned": turned}))
+    begun = client.post(f"{mine}/carry-out", json={"part_is_turned": turned})
+    if begun.is_error:
+        client.delete(mine)
+    _ask(begun)
     by_hand = _ask(client.get(where))["source"]["kind"] == "push"
     said = ""
     while True:
         order = _ask(client.get(mine))
-        if order["status"] in ("done", "failed"):
+        if order["status"] in _OVER:
             return dict(order)
         if by_hand:
             guidance = client.get(f"{mine}/guidance")
@@ -108,25 +122,34 @@ def _said(order: dict[str, Any]) -> str:
 
 
 def _tell_plan(plan: dict[str, Any]) -> None:
+    """The numbers as a table that fits a narrow terminal, and below it what each pass is for, uncut."""
     table = Table(title="Recommended passes", title_justify="left")
-    for name in ("#", "from mm", "to mm", "spacing mm", "lines", "s", "gain mm²", "mm²/s"):
+    for name in ("#", "from mm", "to mm", "spacing", "lines", "s", "gain mm²", "mm²/s"):
         table.add_column(name, justify="right")
-    table.add_column("serves")
-    table.add_column("first")
     for one in plan["passes"]:
-        named = [str(item["region"]) for item in one["serves"] if item["region"] is not None]
-        more = f" and {len(named) - 3} more" if len(named) > 3 else ""
-        unseen = "unseen surface" if len(named) < len(one["serves"]) else ""
-        serves = ", ".join(filter(None, (f"regions {', '.join(named[:3])}{more}" if named else "", unseen)))
         table.add_row(
             str(one["number"]), f"{one['start_mm']:.1f}", f"{one['end_mm']:.1f}", f"{one['line_spacing_mm']:.3f}",
             str(one["lines"]), f"{one['duration_s'] + one['approach_s']:.1f}", f"{one['gain_mm2']:.0f}",
-            f"{one['gain_per_s_mm2']:.1f}", serves, one["turn_part"] or "",
+            f"{one['gain_per_s_mm2']:.1f}",
         )  # fmt: skip
-    console.print(table)
+    if plan["passes"]:
+        console.print(table)
+    else:
+        console.print("No pass is recommended.")
+    for one in plan["passes"]:
+        first = f"; first {one['turn_part']} (then say --turned)" if one["turn_part"] else ""
+        said = f"pass {one['number']} serves {_served(one)}{first}"
+        console.print(said, highlight=False, soft_wrap=True)
     for lost in plan["unreachable"]:
         what = "surface outside of any region" if lost["region"] is None else f"region {lost['region']}"
         console.print(f"{what}: {lost['area_mm2']:.1f} mm² unreachable: {lost['why']}", highlight=False, soft_wrap=True)
+
+
+def _served(one: dict[str, Any]) -> str:
+    named = [str(item["region"]) for item in one["serves"] if item["region"] is not None]
+    regions = f"region{'s' if len(named) > 1 else ''} {', '.join(named)}" if named else ""
+    unseen = "unseen surface" if len(named) < len(one["serves"]) else ""
+    return " and ".join(filter(None, (regions, unseen))) or "nothing"
 
 
 def _tell_orders(orders: list[dict[str, Any]]) -> None:

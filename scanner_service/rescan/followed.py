@@ -2,18 +2,20 @@
 
 A region is known by the surface it covers, cut into cubes of a few radii. A new region takes the id of the old one it
 shares most cubes with, of the same reason first. An old region that no new one continues is *resolved* when all points
-on its cubes are settled, unless something of its points was not judged again; until then it keeps its status. Every
+on its cubes are settled, unless something of its points was not judged again; until then it keeps its status. A shadow
+over which a later pass went has to be shown: as long as most of its surface has no points, it is *rescanned*. Every
 change is a moment of its history. Knows no session and no record.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from drivers.scanline import BoolArray
+from drivers.scanline import BoolArray, Float64Array
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.judgement import REMEDIES, Reason
 from scanner_service.rescan.region import RegionMoment, RegionStatus, RescanRegion
@@ -24,6 +26,8 @@ _OVER = 0.1  # share of a region's cubes that a later pass must touch before the
 _MOST_MOMENTS = 64
 _KEPT_CUBES = 40
 _MOST_RESOLVED = 1000
+_SHOWN = 0.3  # share of a shadow's surface that has points near, from which on a verdict without it is believed
+_MOST_PLACES = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +48,7 @@ class _Known:
     region: RescanRegion
     cubes: set[tuple[int, int, int]]
     passes: frozenset[int]  # that had points on it when it was found, or when it last counted as rescanned
+    places_mm: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))  # spread over a shadow's surface
 
 
 class RegionBook:
@@ -93,6 +98,10 @@ class RegionBook:
                 continue
             if not surface.is_settled(old.cubes) or not surface.is_there(old.cubes, old.region):
                 kept[known_id] = old  # it waits for points to settle
+                continue
+            later = surface.passes_on(old.cubes) - old.passes
+            if (later or old.region.status is RegionStatus.RESCANNED) and not surface.shows(old):
+                kept[known_id] = self._still_bare(known_id, old, later, changes)
                 continue
             merged = [other for other, cubes in zip(ids, fresh, strict=True) if other and len(cubes & old.cubes)]
             why = f"is part of region {merged[0]} now" if merged else "its surface meets the requirement"
@@ -180,7 +189,8 @@ class RegionBook:
     ) -> _Known:
         moment = RegionMoment(self._version, RegionStatus.OPEN, region.area_mm2, region.priority, "found")
         changes.append(Change(self._next, region.reason, moment))
-        return _Known(replace(region, region_id=self._next, history=(moment,)), cubes, passes)
+        known = replace(region, region_id=self._next, history=(moment,))
+        return _Known(known, cubes, passes, _places_of(region))
 
     def _continued(
         self,
@@ -202,8 +212,17 @@ class RegionBook:
             replace(region, region_id=known_id, status=old.region.status, history=old.region.history),
             cubes,
             passes | old.passes,
+            _places_of(region),
         )
         return _stepped(known_id, known, status, why, self._version, changes) if why else known
+
+    def _still_bare(self, known_id: int, old: _Known, later: frozenset[int], changes: list[Change]) -> _Known:
+        """A shadow that no verdict finds any more, although nothing was measured on most of its surface."""
+        if not later:
+            return old
+        why = "a later pass was over it, and most of its surface has no points still"
+        known = replace(old, passes=old.passes | later)
+        return _stepped(known_id, known, RegionStatus.RESCANNED, why, self._version, changes)
 
     def _matched(self, regions: Sequence[RescanRegion], fresh: list[set[tuple[int, int, int]]]) -> list[int]:
         """The id that each new region takes; 0: a new one."""
@@ -236,6 +255,8 @@ class _Surface:
 
     def __init__(self, snapshot: MapSnapshot) -> None:
         counted = np.flatnonzero(snapshot.neighbours > 0)
+        self._points_mm = snapshot.points_mm[counted]
+        self._radius_mm = float(np.median(snapshot.radius_mm[counted])) if len(counted) else 0.0
         self._cube = _cube_rows(snapshot.points_mm[counted])
         self._pass = snapshot.lines.pass_number[snapshot.line[counted]]
         self._open: BoolArray = ~snapshot.settled[counted]
@@ -262,6 +283,18 @@ class _Surface:
         """True when no point in the cubes waits."""
         return not any(self._open[rows].any() for rows in self._rows(cubes))
 
+    def shows(self, known: _Known) -> bool:
+        """True when points lie near to enough of a shadow's surface; of other regions there have been points before."""
+        if not len(known.places_mm):
+            return True
+        reach = float(np.fmax(self._radius_mm, known.region.line_spacing_mm))
+        low, high = known.places_mm.min(axis=0) - reach, known.places_mm.max(axis=0) + reach
+        around = self._points_mm[((self._points_mm >= low) & (self._points_mm <= high)).all(axis=1)]
+        if not len(around):
+            return False
+        away = cKDTree(around).query(known.places_mm, distance_upper_bound=reach)[0]
+        return float(np.isfinite(away).mean()) >= _SHOWN
+
     def is_there(self, cubes: set[tuple[int, int, int]], region: RescanRegion) -> bool:
         """True when the cubes still hold points: a withdrawn pass resolves nothing. Untouched surface never had any."""
         return region.reason is Reason.UNTOUCHED or any(len(rows) for rows in self._rows(cubes))
@@ -272,12 +305,24 @@ def _stepped(known_id: int, old: _Known, status: RegionStatus, why: str, version
     moment = RegionMoment(version, status, region.area_mm2, region.priority, why)
     changes.append(Change(known_id, region.reason, moment))
     history = (*region.history, moment)[-_MOST_MOMENTS:]
-    return _Known(replace(region, status=status, history=history), old.cubes, old.passes)
+    return replace(old, region=replace(region, status=status, history=history))
 
 
 def _cubes_of(snapshot: MapSnapshot, region: RescanRegion) -> set[tuple[int, int, int]]:
     points = [snapshot.points_mm[region.point_rows], *region.outline_mm]
     return {tuple(cube) for cube in np.unique(_cube_rows(np.concatenate(points)), axis=0).tolist()}
+
+
+def _places_of(region: RescanRegion) -> Float64Array:
+    """Places (k, 3) inside the loops of a shadow, on the triangles between each loop's sides and its middle."""
+    if region.reason is not Reason.SHADOW:
+        return np.zeros((0, 3))
+    found = []
+    for loop in region.outline_mm:
+        middle, after = loop.mean(axis=0), np.roll(loop, -1, axis=0)
+        found += [middle + share * (0.5 * (loop + after) - middle) for share in (0.3, 0.6)]
+    places = np.concatenate(found) if found else np.zeros((0, 3))
+    return np.asarray(places[:: max(1, math.ceil(len(places) / _MOST_PLACES))], dtype=np.float64)
 
 
 def _cube_rows(points_mm: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> IntArray:

@@ -20,6 +20,7 @@ from scanner_service.rescan.outline import patch_of
 from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of
 from scanner_service.rescan.regions import RegionReport
 from scanner_service.rescan.requirement import Interest, Requirement
+from scanner_service.rescan.stations import IntArray
 
 _MOST_PIECES = 400_000
 _LEAST_POINTS = 200  # of a scan before it can tell whether the mesh lies where the part lies
@@ -132,13 +133,17 @@ class ReferenceCoverage:
     """How much of the nominal part is scanned well enough; mm² of its surface.
 
     `share` = good_mm2 / area_mm2, `touched_share` = touched_mm2 / area_mm2. `untouched` are the patches that no point
-    has touched, as regions without a number, the largest first.
+    has touched, as regions without a number, the largest first; `untouched_rows` which of the `pieces` (k) make up
+    each. `touched` (k,) are the pieces that a point has touched.
     """
 
     area_mm2: float
     touched_mm2: float
     good_mm2: float
     untouched: tuple[RescanRegion, ...]
+    untouched_rows: tuple[IntArray, ...]
+    pieces: "Pieces"
+    touched: BoolArray
 
     @property
     def share(self) -> float:
@@ -201,11 +206,15 @@ def reference_coverage(
     reach = max(0.6 * pieces.size_mm, float(np.quantile(report.strips.reach_mm, 0.9)) if len(snapshot) else 0.0)
     touched = _reached(pieces, snapshot, counted, reach)
     good = touched & _reached(pieces, snapshot, good_point, reach)
+    untouched = _untouched(pieces, ~touched, requirement, radius)
     return ReferenceCoverage(
         area_mm2=float(pieces.area_mm2.sum()),
         touched_mm2=float(pieces.area_mm2[touched].sum()),
         good_mm2=float(pieces.area_mm2[good].sum()),
-        untouched=_untouched(pieces, ~touched, requirement, radius),
+        untouched=tuple(region for region, _ in untouched),
+        untouched_rows=tuple(rows for _, rows in untouched),
+        pieces=pieces,
+        touched=touched,
     )
 
 
@@ -232,11 +241,13 @@ def _reached(pieces: Pieces, snapshot: MapSnapshot, wanted: BoolArray, reach_mm:
     return np.asarray((np.isfinite(distance) & facing).any(axis=1))
 
 
-def _untouched(pieces: Pieces, bare: BoolArray, requirement: Requirement, radius_mm: float) -> tuple[RescanRegion, ...]:
-    """Untouched pieces that hang together, as regions."""
+def _untouched(
+    pieces: Pieces, bare: BoolArray, requirement: Requirement, radius_mm: float
+) -> list[tuple[RescanRegion, IntArray]]:
+    """Untouched pieces that hang together, as regions with the rows of their pieces."""
     rows = np.flatnonzero(bare)
     if not len(rows):
-        return ()
+        return []
     pairs = cKDTree(pieces.points_mm[rows]).query_pairs(_BESIDE * pieces.size_mm, output_type="ndarray")
     cosine = np.einsum("ij,ij->i", pieces.normals[rows[pairs[:, 0]]], pieces.normals[rows[pairs[:, 1]]])
     pairs = pairs[cosine >= np.cos(np.radians(requirement.region_angle_deg))]
@@ -251,25 +262,24 @@ def _untouched(pieces: Pieces, bare: BoolArray, requirement: Requirement, radius
         points = pieces.points_mm[mine]
         size = np.full(len(mine), pieces.size_mm)
         patch = patch_of(points, _BESIDE * size, size)
-        found.append(
-            RescanRegion(
-                number=0,
-                reason=Reason.UNTOUCHED,
-                outline_mm=patch.loops,
-                area_mm2=area,
-                centroid_mm=np.average(points, axis=0, weights=pieces.area_mm2[mine]),
-                normal=mean_normal(pieces.normals[mine]),
-                measured_per_mm2=0.0,
-                required_per_mm2=float("nan") if requirement.density_per_mm2 is None else requirement.density_per_mm2,
-                counting_error_per_mm2=0.0,
-                priority=priority_of(1.0, area),
-                point_count=0,
-                remedy=REMEDIES[Reason.UNTOUCHED],
-                point_rows=np.zeros(0, dtype=np.int64),
-                line_spacing_mm=float("nan") if requirement.line_spacing_mm is None else requirement.line_spacing_mm,
-            )
+        region = RescanRegion(
+            number=0,
+            reason=Reason.UNTOUCHED,
+            outline_mm=patch.loops,
+            area_mm2=area,
+            centroid_mm=np.average(points, axis=0, weights=pieces.area_mm2[mine]),
+            normal=mean_normal(pieces.normals[mine]),
+            measured_per_mm2=0.0,
+            required_per_mm2=float("nan") if requirement.density_per_mm2 is None else requirement.density_per_mm2,
+            counting_error_per_mm2=0.0,
+            priority=priority_of(1.0, area),
+            point_count=0,
+            remedy=REMEDIES[Reason.UNTOUCHED],
+            point_rows=np.zeros(0, dtype=np.int64),
+            line_spacing_mm=float("nan") if requirement.line_spacing_mm is None else requirement.line_spacing_mm,
         )
-    return tuple(sorted(found, key=lambda region: -region.area_mm2))
+        found.append((region, mine.astype(np.int64)))
+    return sorted(found, key=lambda pair: -pair[0].area_mm2)
 
 
 def _middles(cuts: int) -> tuple[Float64Array, Float64Array]:

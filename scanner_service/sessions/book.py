@@ -50,9 +50,11 @@ class SessionBook:
         retention: Retention | None = None,
         clock: Callable[[], datetime] = utc_now,
         meshes: Path | None = None,
+        rigs: Path | None = None,
     ) -> None:
         self.record = record
         self._meshes = meshes  # the folder in which reference meshes lie
+        self._rigs = rigs  # the folder in which rig files lie
         self.retention = retention or Retention()
         self._clock = clock
         self._live: dict[str, LiveSession] = {}
@@ -218,7 +220,7 @@ class SessionBook:
         with self._lock:
             known = self._desks.get(session.row.session_id)
             if known is None or known[0] is not session:
-                known = self._desks[session.row.session_id] = (session, PassDesk(session))
+                known = self._desks[session.row.session_id] = (session, PassDesk(session, self._rigs))
             return known[1]
 
     def live(self, session_id: str) -> LiveSession | None:

@@ -12,6 +12,7 @@ import numpy as np
 from drivers.errors import DriverError
 from drivers.protocols.scanner_events import PassEnded
 from drivers.protocols.stage_events import PositionLost, StageDisconnected, StageReconnected
+from drivers.rig_description import RigDescription
 from drivers.rig_limits import PassOrder
 from drivers.running_rig import RigEvent, RigPassEnded, RunningRig
 from drivers.scanline import DeviceInfo, Float64Array, Scanline, SensorGeometry
@@ -32,12 +33,26 @@ class Preparation:
 
 
 class RigSource:
-    """One pass of a rig that is entered already."""
+    """One pass of a rig that is entered already.
 
-    def __init__(self, rig: RunningRig, order: PassOrder, info: DeviceInfo, preparation: Preparation) -> None:
+    `description` is what the rig is made of as it stands without anybody's turn of the part; `rests_at_mm` is where the
+    stage was left by a pass that was driven to its end, None where nobody knows.
+    """
+
+    def __init__(
+        self,
+        rig: RunningRig,
+        order: PassOrder,
+        info: DeviceInfo,
+        preparation: Preparation,
+        description: RigDescription,
+    ) -> None:
         self.geometry: SensorGeometry | None = rig.limits.geometry or info.geometry
         self.towards_sensor: Float64Array | None = rig.pose_at(order.start_mm).rotate(np.array([0.0, 0.0, 1.0]))
         self.info = info
+        self.description = description
+        self.is_driven = rig.is_driven
+        self.rests_at_mm: float | None = None
         self._rig = rig
         self._order = order
         self._preparation = preparation
@@ -104,6 +119,8 @@ class RigSource:
             for event in self._rig.events(0.1):
                 if isinstance(event, RigPassEnded):
                     sink.note("pass_ended", {"reason": event.reason, **event.report.to_dict()})
+                    if event.reason == "reached_end" and event.failure is None and self.is_driven:
+                        self.rests_at_mm = self._order.end_mm
                     return event.failure
                 self._pass_on(event, sink)
 

@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from typing import Any
 
@@ -32,7 +32,7 @@ from scanner_service.sessions.status import Status
 from scanner_service.sessions.updates import Changes, PointPage, VerdictBook, changes_since, read_page
 from scanner_service.sessions.withdrawals import SCAN_ENDED, WITHDRAWN
 from scanner_service.storage.record import Record
-from scanner_service.storage.rows import SessionRow, Stored
+from scanner_service.storage.rows import EventRow, SessionRow, Stored
 
 _LOG = logging.getLogger(__name__)
 ANALYSIS_PERIOD_S = 1.0
@@ -324,6 +324,10 @@ class LiveSession:
     def event(self, kind: str, details: dict[str, Any]) -> None:
         """Put an event into the session's record."""
         self._chronicle.event(kind, details)
+
+    def past_events(self) -> Iterator[EventRow]:
+        """The events that the record holds of the session, the oldest first."""
+        return self._record.events(self.row.session_id)
 
     def results(self) -> Results | None:
         """The latest verdict; None before the first."""

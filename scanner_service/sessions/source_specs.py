@@ -102,7 +102,7 @@ class RigSpec:
         if why is not None:
             raise SourceUnusable(f"{why}; choose other ends, or correct the rig file")
         rig = RunningRig(description)
-        return RigSource(rig, order, rig.enter(), Preparation(self.home, self.at_mm))
+        return RigSource(rig, order, rig.enter(), Preparation(self.home, self.at_mm), description)
 
     def to_dict(self) -> dict[str, Any]:
         """As it is kept in the record."""

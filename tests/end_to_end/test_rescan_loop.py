@@ -48,3 +48,25 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
         "axis": "free_pose", "scanner": {"laser_mm": [0, 0, 150], "camera_mm": [0, 76, 150], "range_mm": [-30, 30],
                                          "field_of_view_mm": 50, "points_per_line": 400}})  # fmt: skip
     assert unclear.status_code == 409 and "reach_mm" in unclear.json()["detail"]
+
+
+def test_a_refused_pass_leaves_no_order_and_says_what_to_do(running):
+    service, simulator = running.service(), running.simulator("step")
+    body = {
+        "name": "shadowed",
+        "source": {"kind": "device", "port": simulator.port, "baud_rate": 3_000_000, "line_rate_hz": 100.0,
+                   "line_spacing_mm": 0.3, "start_mm": 0.0, "end_mm": 40.0},
+        "settings": {"density_per_mm2": 10.0},
+    }  # fmt: skip
+    session_id = service.client.post("/api/v1/sessions", json=body).json()["id"]
+    service.start(session_id)
+    service.wait_for_state(session_id, "stopped")
+    passes = json.loads(rescan(service, session_id, "--reason", "shadow").stdout)["passes"]
+    assert all(item["region"] for one in passes for item in one["serves"])
+    turned = next(one for one in passes if one["turn_part"])
+    refused = rescan(service, session_id, "--reason", "shadow", "--pass", str(turned["number"]))
+    assert refused.returncode == 1 and "--turned" in refused.stderr
+    orders = service.client.get(f"/api/v1/sessions/{session_id}/pass-orders").json()["orders"]
+    assert [order["status"] for order in orders] == ["cancelled"]
+    unknown = rescan(service, session_id, "--region", "4711")
+    assert unknown.returncode == 1 and "no region 4711" in unknown.stderr

@@ -1,14 +1,15 @@
-"""Recommended passes: list, accept, carry out, guide, loop; every call is one call of the session's pass desk."""
+"""Recommended passes: list, accept, cancel, carry out, guide, loop; each is one call of the session's pass desk."""
 
 from typing import Annotated
 
 import numpy as np
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Depends, Query, Request
 from starlette.responses import Response
 
 from scanner_service.api.answers import answer
-from scanner_service.api.pass_schemas import CarryOutIn, LoopIn, RigIn
+from scanner_service.api.pass_schemas import CarryOutIn, LoopIn, ReasonName, RegionId, RigIn, serving_of
 from scanner_service.api.routes.sessions import Session, book_of, operator, viewer
+from scanner_service.rescan.passes.serving import Serving
 from scanner_service.sessions.pass_desk import PassDesk
 
 router = APIRouter(prefix="/api/v1/sessions/{session_id}", tags=["passes"])
@@ -22,6 +23,17 @@ def desk_of(request: Request, session: Session) -> PassDesk:
 Desk = Annotated[PassDesk, Depends(desk_of)]
 
 
+def named_serving(
+    region: Annotated[list[RegionId] | None, Query(max_length=1000)] = None,
+    reason: Annotated[list[ReasonName] | None, Query(max_length=10)] = None,
+) -> Serving:
+    """What the passes are to serve: `region` by its id and `reason` may be named several times; none: everything."""
+    return serving_of(region or [], reason or [])
+
+
+Served = Annotated[Serving, Depends(named_serving)]
+
+
 @router.put("/rig", dependencies=[operator])
 def state_rig(desk: Desk, body: RigIn) -> Response:
     """State what the rig can do and what the scanner can see; needed where the service does not drive the scanner."""
@@ -30,15 +42,15 @@ def state_rig(desk: Desk, body: RigIn) -> Response:
 
 
 @router.get("/recommended-passes", dependencies=[viewer])
-def list_passes(desk: Desk) -> Response:
+def list_passes(desk: Desk, serving: Served) -> Response:
     """The recommended passes for the map as it is, the best for its time first, and what none of them can bring."""
-    return answer(desk.plan().to_dict())
+    return answer(desk.plan(serving).to_dict())
 
 
 @router.post("/recommended-passes/{number}/accept", status_code=201, dependencies=[operator])
-def accept_pass(desk: Desk, number: int) -> Response:
-    """Take an order for a pass of the latest plan. Nothing moves before it is carried out."""
-    return answer(desk.accept(number).to_dict(), 201)
+def accept_pass(desk: Desk, number: int, serving: Served) -> Response:
+    """Take an order for a pass of the latest plan for the same regions and reasons. Nothing moves by that."""
+    return answer(desk.accept(number, serving).to_dict(), 201)
 
 
 @router.get("/pass-orders", dependencies=[viewer])
@@ -57,6 +69,12 @@ def get_order(desk: Desk, order: int) -> Response:
 def carry_out(desk: Desk, order: int, body: CarryOutIn) -> Response:
     """Drive an accepted pass, or wait for the scanlines that a hand brings. The laser is switched on."""
     return answer(desk.carry_out(order, body.part_is_turned).to_dict())
+
+
+@router.delete("/pass-orders/{order}", dependencies=[operator])
+def cancel_order(desk: Desk, order: int) -> Response:
+    """Give up an accepted pass that was not carried out; it stays in the list, as cancelled."""
+    return answer(desk.cancel(order).to_dict())
 
 
 @router.get("/pass-orders/{order}/guidance", dependencies=[viewer])

@@ -11,7 +11,7 @@ import numpy as np
 
 from drivers.scanline import BoolArray, Float64Array, Pose
 from scanner_service.rescan.passes.errors import PassOutOfReach
-from scanner_service.rescan.passes.gain import MARGIN, Prospect, prospect_of
+from scanner_service.rescan.passes.gain import MARGIN, SERVED, Prospect, prospect_of
 from scanner_service.rescan.passes.known_surface import KnownSurface
 from scanner_service.rescan.passes.motion import Motion, StraightMotion
 from scanner_service.rescan.passes.needs import Needs
@@ -20,8 +20,11 @@ from scanner_service.rescan.passes.reach import Attitude, Reach
 from scanner_service.rescan.passes.stretch import Stretch, best_stretch
 from scanner_service.rescan.passes.visibility import OpenSky
 
+ROUGH = 80
+"""So many of the attitudes that see most are looked at for where to hold them."""
 EXACT = 10
 """So many of the roughly best are judged exactly, and the winner's neighbours after them."""
+_LEAST_PASS_S = 1.0  # no pass takes less, whatever it serves
 _ENDLESS = (-math.inf, math.inf)
 
 
@@ -50,20 +53,17 @@ class Cover:
 
     def __init__(self, surface: KnownSurface, needs: Needs, sky: OpenSky, reach: Reach, optics: ScannerOptics) -> None:
         self._surface, self._needs, self._sky, self._reach, self._optics = surface, needs, sky, reach, optics
-        middle = surface.points_mm.mean(axis=0) if len(surface.points_mm) else np.zeros(3)
-        self.attitudes = reach.attitudes(middle)
+        self._middle_mm = surface.points_mm.mean(axis=0) if len(surface.points_mm) else np.zeros(3)
+        self.attitudes = reach.attitudes(self._middle_mm)
         self.left_mm2 = needs.gain_mm2.copy()
-        self._visible = [self._roughly_seen(attitude) for attitude in self.attitudes]
-        self.reachable: BoolArray = np.zeros(len(needs), dtype=np.bool_)
-        for seen in self._visible:
-            self.reachable |= seen
+        self._visible: BoolArray = np.array([self._roughly_seen(attitude) for attitude in self.attitudes])
+        self.reachable: BoolArray = np.asarray(self._visible.any(axis=0))
 
     def next(self, standing: Pose | None) -> Choice | None:
         """The best pass for what is left; None when nothing is."""
         ranked: list[Candidate] = []
-        for attitude, seen in zip(self.attitudes, self._visible, strict=True):
-            if float(self.left_mm2[seen].sum()) > 0:
-                ranked += self._rough(attitude, seen, standing)
+        for number in self._promising(standing):
+            ranked += self._rough(self.attitudes[number], self._visible[number], standing)
         ranked.sort(key=lambda one: -one.worth_per_s)
         best: Choice | None = None
         for candidate in ranked[:EXACT]:
@@ -76,6 +76,19 @@ class Cover:
                 best = self._better(best, self._exact(attitude, candidate.motion, standing)) or best
         self.left_mm2[best.served] = 0.0
         return best
+
+    def _promising(self, standing: Pose | None) -> list[int]:
+        """The attitudes that see most for the time it takes to get there, those that see nothing left out."""
+        gain = self._visible @ self.left_mm2
+        way = np.array([self._reach.seconds_between(standing, self._held(one), one.turn) for one in self.attitudes])
+        order = np.argsort(-gain / (_LEAST_PASS_S + way), kind="stable")
+        return [int(number) for number in order[:ROUGH] if gain[number] > 0]
+
+    def _held(self, attitude: Attitude) -> Pose:
+        """A pose in this attitude, as far as it is known before there is a place for it."""
+        if attitude.motion is not None:
+            return attitude.motion.part_from_sensor(0.0)
+        return Pose(attitude.rotation.copy(), self._middle_mm.copy())
 
     def _better(self, one: Choice | None, other: Choice | None) -> Choice | None:
         if one is None or other is None:
@@ -92,7 +105,7 @@ class Cover:
         laser = attitude.rotation @ (geometry.laser_mm / np.linalg.norm(geometry.laser_mm))
         camera = attitude.rotation @ (geometry.camera_mm / np.linalg.norm(geometry.camera_mm))
         seen: BoolArray = (
-            (needs.normals @ laser >= math.cos(self._optics.max_incidence_rad))
+            (needs.normals @ laser >= np.cos(np.minimum(self._optics.max_incidence_rad, needs.incidence_rad)))
             & (needs.normals @ camera >= math.cos(self._optics.max_camera_rad))
             & self._sky.along(laser)
             & self._sky.along(camera)
@@ -157,8 +170,8 @@ class Cover:
             self._reach.check(motion, stretch.start_mm, stretch.end_mm, stretch.line_spacing_mm)
         except PassOutOfReach:
             return None
-        # the margin is for choosing; what reaches the density without it is a gain as well
-        served = stretch.serves(prospect.position_mm, MARGIN * prospect.coarsest_mm) & (self.left_mm2 > 0)
+        # the margin is for choosing; what reaches the density with less of it is a gain as well
+        served = stretch.serves(prospect.position_mm, MARGIN / SERVED * prospect.coarsest_mm) & (self.left_mm2 > 0)
         return Choice(attitude, motion, stretch, prospect, served)
 
     def _middle(self, prospect: Prospect) -> float:

@@ -5,15 +5,13 @@ import numpy as np
 from drivers.scanline import SensorGeometry
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.errors import OpticsUnknown
-from scanner_service.rescan.passes.motion import StraightMotion
+from scanner_service.rescan.passes.motion import Motion
 from scanner_service.rescan.passes.optics import ScannerOptics
 
 _LEAST_POINTS = 50
 
 
-def measured_optics(
-    snapshot: MapSnapshot, geometry: SensorGeometry, motion: StraightMotion, rays: int
-) -> ScannerOptics:
+def measured_optics(snapshot: MapSnapshot, geometry: SensorGeometry, motion: Motion, rays: int) -> ScannerOptics:
     """The optics of a scanner whose rays pass z = 0 at equal steps, from points of a pass that was driven by `motion`.
 
     The place at which a point's ray passes z = 0 is a straight line over its number in the scanline.

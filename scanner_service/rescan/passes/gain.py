@@ -12,8 +12,13 @@ from scanner_service.rescan.passes.needs import Needs
 from scanner_service.rescan.passes.optics import ScannerOptics
 from scanner_service.rescan.passes.visibility import both_see
 
-MARGIN = 1.15
-"""The density aimed at is this much above the one required: normals are estimates, and some rays are lost by chance."""
+SLACK = 1.05
+"""Lines are planned this much closer than they may be: normals are estimates."""
+MARGIN = 1.25
+"""The density aimed at is this much above the one required: normals are estimates, some rays are lost by chance, and
+points do not lie evenly."""
+SERVED = 1.1
+"""What gets this much more than is required counts as served."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +52,8 @@ def prospect_of(surface: KnownSurface, needs: Needs, motion: Motion, optics: Sca
     -----
     A ray and a line stand for the area δp·Δs·|v| across the ray, which a surface of normal n spreads over that area
     times |d_z| / |n·d|, with d the ray's direction and d_z its part along the sensor's z; so
-    ρ = |n·d| / (|d_z|·δp(z)·Δs·|v|), which is 1/(Δs'·δp') of section 1 of the method for a straight pass.
+    ρ = |n·d| / (|d_z|·δp(z)·Δs·|v|), which is 1/(Δs'·δp') of section 1 of the method for a straight pass. There, too,
+    the lines lie Δs' = Δs·|v| / sqrt(1 - (n·m)²) apart on the surface, with m the normal of the laser plane.
     """
     sights = motion.sights(needs.places_mm, optics)
     to_laser = sights.laser_mm - needs.places_mm
@@ -58,14 +64,18 @@ def prospect_of(surface: KnownSurface, needs: Needs, motion: Motion, optics: Sca
         camera = np.einsum("ij,ij->i", needs.normals, to_camera) / np.linalg.norm(to_camera, axis=1)
         upright = (optics.geometry.laser_mm[2] - sights.local_mm[:, 2]) / distance
         density = cosine / (upright * optics.point_spacing_mm(sights.local_mm[:, 2]) * sights.advance)
+        sine = np.sqrt(np.maximum(1.0 - np.einsum("ij,ij->i", needs.normals, sights.plane) ** 2, 1e-12))
+        by_lines = needs.spacing_mm * sine / (SLACK * sights.advance)
     low, high = optics.geometry.range_mm
     met = np.isfinite(sights.position_mm) & (density > 0)
-    too_steep = ~(cosine >= math.cos(optics.max_incidence_rad)) | ~(camera >= math.cos(optics.max_camera_rad))
+    too_steep = ~(cosine >= np.cos(np.minimum(optics.max_incidence_rad, needs.incidence_rad))) | ~(
+        camera >= math.cos(optics.max_camera_rad)
+    )
     out_of_range = ~((sights.local_mm[:, 2] >= low) & (sights.local_mm[:, 2] <= high))
     out_of_fan = ~(np.abs(optics.across(sights.local_mm)) <= 1.0)
     asked = met & ~(too_steep | out_of_range | out_of_fan)
     laser, both = both_see(surface, needs.places_mm, needs.normals, sights, asked)
-    coarsest = np.where(both, density / (MARGIN * needs.density_per_mm2), 0.0)
+    coarsest = np.where(both, np.fmin(density / (MARGIN * needs.density_per_mm2), by_lines), 0.0)
     return Prospect(
         position_mm=sights.position_mm.copy(),
         incidence_rad=np.arccos(np.clip(cosine, -1.0, 1.0)),

@@ -13,15 +13,18 @@ import numpy.typing as npt
 from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.looks import Look, mark_empty
-from scanner_service.rescan.passes.marching import SURFACE, carve, fill_pockets, gather, open_faces, outward
+from scanner_service.rescan.passes.marching import SURFACE, carve, fill_pockets, gather, open_faces, outward, surrounded
 from scanner_service.rescan.passes.optics import ScannerOptics
+from scanner_service.rescan.passes.solid import set_nominal
+from scanner_service.rescan.reference import Pieces
 
 IntArray = npt.NDArray[np.int64]
 MAX_CELLS = 6_000_000
 MAX_OPEN = 200_000
-LEAST_CELL_MM = 0.5
+LEAST_CELL_MM = 0.35
 _LINES_IN_A_CELL = 1.3  # so that a surface at the coarsest line spacing leaves no cell empty
 _ONE_SIDED = 0.6  # length of the mean normal below which the normals of a cell point both ways
+_FACING = 8.0  # hidden space that is thinner than this tells of no surface; a plane boundary gives 25
 _MARGIN_MM = 1.5  # how far beyond the outermost points hidden surface is reckoned with: the next pass sees further
 
 
@@ -33,7 +36,7 @@ class KnownSurface:
     `points_mm`, `normals` (m, 3; unit, towards the laser), `area_mm2`, `count`, `failing_share` (m,) and `region` (m,),
     the number that failing points gave (0: none); `two_sided` (m,) where both sides of a thin wall were seen.
     `frontier_mm`, `frontier_normals` (f, 3) and `frontier_mm2` (f,) are where hidden space begins: surface that no
-    point has touched may be there.
+    point has touched may be there. `frontier_solid` (f,) is the share of what is solid or hidden around.
     """
 
     low_mm: Float64Array
@@ -49,6 +52,7 @@ class KnownSurface:
     frontier_mm: Float64Array
     frontier_normals: Float64Array
     frontier_mm2: Float64Array
+    frontier_solid: Float64Array
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -70,6 +74,7 @@ def know_surface(
     cell_mm: float | None = None,
     looks: tuple[Look, ...] = (),
     optics: ScannerOptics | None = None,
+    nominal: Pieces | None = None,
 ) -> KnownSurface:
     """The surface a map knows.
 
@@ -80,6 +85,8 @@ def know_surface(
     region : (n,) number of the region of a failing point, 0 for none.
     cell_mm : side of a cell; None: wide enough for the map's line spacing and for at most MAX_CELLS cells.
     looks, optics : passes whose poses are known, and the scanner's: what they looked into in vain is not hidden.
+    nominal : the nominal part, where there is one: what lies outside of it is not hidden, and its surface stands in the
+        way.
     """
     use = snapshot.neighbours > 0
     points = snapshot.points_mm
@@ -108,9 +115,13 @@ def know_surface(
     normals = _normals(sums[:, 3:6], state, low, side, places, lines.laser_mm)
     # so many cells does a plane of this slope cut through on a square of one cell
     area = side * side / np.maximum(np.abs(normals).sum(axis=1), 1.0)
+    if nominal is not None:
+        set_nominal(state, low, side, nominal)
     open_cells, gradient = _frontier(state)
     if looks and optics is not None and mark_empty(state, low, side, looks, optics, open_cells, gradient):
         open_cells, gradient = _frontier(state)
+    solid = np.zeros(len(open_cells))
+    surrounded(state, open_cells, solid)
     return KnownSurface(
         low_mm=low,
         cell_mm=side,
@@ -125,6 +136,7 @@ def know_surface(
         frontier_mm=low + (open_cells + 0.5) * side,
         frontier_normals=gradient,
         frontier_mm2=side * side / np.maximum(np.abs(gradient).max(axis=1, initial=0.5), 0.5),
+        frontier_solid=solid,
     )
 
 
@@ -135,7 +147,7 @@ def _frontier(state: npt.NDArray[np.uint8]) -> tuple[IntArray, Float64Array]:
     gradient = np.zeros((len(cells), 3))
     outward(state, cells, gradient)
     length = np.linalg.norm(gradient, axis=1)
-    sure = length > 1.0
+    sure = length > _FACING
     return cells[sure], gradient[sure] / length[sure, None]
 
 
@@ -179,4 +191,5 @@ def _nothing() -> KnownSurface:
     return KnownSurface(
         np.zeros(3), LEAST_CELL_MM, np.zeros((1, 1, 1), dtype=np.uint8), none, none.copy(), flat, whole, flat.copy(),
         whole.copy(), np.zeros(0, dtype=np.bool_), none.copy(), none.copy(), flat.copy(),
+        flat.copy(),
     )  # fmt: skip

@@ -14,14 +14,15 @@ class Sights:
     """Places (n, 3) as a moving sensor sees them, each at the moment when the laser plane goes through it.
 
     `position_mm` (n,) is the stage position then (NaN: never), `local_mm` (n, 3) the place in the sensor frame,
-    `laser_mm` and `camera_mm` (n, 3) stand in the part frame, `advance` (n,) is how far the laser plane goes at the
-    place for a millimetre of stage position.
+    `laser_mm` and `camera_mm` (n, 3) stand in the part frame, and so does `plane` (n, 3), the unit normal of the laser
+    plane; `advance` (n,) is how far that goes at the place for a millimetre of stage position.
     """
 
     position_mm: Float64Array
     local_mm: Float64Array
     laser_mm: Float64Array
     camera_mm: Float64Array
+    plane: Float64Array
     advance: Float64Array
 
 
@@ -47,13 +48,14 @@ class StraightMotion:
         if abs(along[1]) < 1e-9:  # the plane would slide within itself
             never = np.full(len(places_mm), np.nan)
             nowhere = np.full_like(places_mm, np.nan)
-            return Sights(never, local, nowhere, nowhere, never)
+            return Sights(never, local, nowhere, nowhere, nowhere, never)
         position = local[:, 1] / along[1]
         shift = position[:, None] * self.travel
         laser = self.at_zero.apply(optics.geometry.laser_mm) + shift
         camera = self.at_zero.apply(optics.geometry.camera_mm) + shift
         local = local - position[:, None] * along
-        return Sights(position, local, laser, camera, np.full(len(places_mm), abs(float(along[1]))))
+        plane = np.broadcast_to(rotation[:, 1], places_mm.shape)
+        return Sights(position, local, laser, camera, plane, np.full(len(places_mm), abs(float(along[1]))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +111,7 @@ class TurningMotion:
                             (found.local_mm, best.local_mm),
                             (found.laser_mm, best.laser_mm),
                             (found.camera_mm, best.camera_mm),
+                            (found.plane, best.plane),
                             (found.advance, best.advance),
                         )
                     )
@@ -133,7 +136,8 @@ class TurningMotion:
             self._turned(angle, self.at_zero.apply(where))
             for where in (optics.geometry.laser_mm, optics.geometry.camera_mm)
         )
-        return Sights(angle * self.radius_mm, local, laser, camera, advance)
+        plane = self._turned(angle, self.at_zero.rotation[:, 1])
+        return Sights(angle * self.radius_mm, local, laser, camera, plane, advance)
 
     def _turned(self, angle: Float64Array, where_mm: Float64Array) -> Float64Array:
         """One place of the stage frame (3,) turned by each angle (n,): (n, 3)."""

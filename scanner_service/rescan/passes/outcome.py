@@ -1,23 +1,23 @@
 """What a pass promised against what it brought, region by region; plans nothing."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from drivers.scanline import Float64Array, read_only
+from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.known_surface import KnownSurface, know_surface
-from scanner_service.rescan.passes.needs import UNSEEN, failing_points
+from scanner_service.rescan.passes.needs import UNSEEN, Evidence, failing_points
 from scanner_service.rescan.passes.recommendation import RecommendedPass
 from scanner_service.rescan.regions import RegionReport
 
-_RECENT = 3
-_TRUST = (0.5, 1.6)
-_LEAST_MM2 = 20.0  # smaller promises say little
 _SAME = 0.75  # cells: surface this near to surface that was good before is not new
-_BESIDE = 4.0  # cells: new good surface this far from every place served belongs to no region
+_BESIDE_MM = 2.0  # new good surface further than this from every place served was promised by nobody
+_THERE = 1.5  # cells: a place is good when new good surface that faces alike is this near
+_NOBODY = -1
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +35,35 @@ class RegionOutcome:
 
 
 @dataclass(frozen=True, slots=True)
+class KindOutcome:
+    """What became of the places of one kind of evidence.
+
+    `asked_mm2` is the area that was asked for, edges of hidden space counted for less; `kept_mm2` the whole area of the
+    places that are good now.
+    """
+
+    evidence: Evidence
+    asked_mm2: float
+    kept_mm2: float
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {"evidence": self.evidence.name.lower(), "asked_mm2": self.asked_mm2, "kept_mm2": self.kept_mm2}
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a pass: region by region, and `missed_mm` (k, 3), the places it was to serve and did not."""
+    """What became of a pass: region by region, and by the kind of evidence.
+
+    `kept_mm2` is the area, as it was foretold, of the places that are good now; `besides_mm2` is good surface that was
+    found where nothing was promised. `missed_mm` (k, 3) are the places that the pass was to serve and did not.
+    """
 
     regions: tuple[RegionOutcome, ...]
     missed_mm: Float64Array
+    kinds: tuple[KindOutcome, ...] = ()
+    kept_mm2: float = 0.0
+    besides_mm2: float = 0.0
 
     def __post_init__(self) -> None:
         read_only(self.missed_mm)
@@ -51,7 +75,7 @@ class Outcome:
 
     @property
     def reached_mm2(self) -> float:
-        """All that meets the requirement now and did not before."""
+        """All that meets the requirement now, did not before, and lies where something was promised."""
         return sum(one.reached_mm2 for one in self.regions)
 
     def to_dict(self) -> dict[str, object]:
@@ -59,8 +83,34 @@ class Outcome:
         return {
             "promised_mm2": self.promised_mm2,
             "reached_mm2": self.reached_mm2,
+            "besides_mm2": self.besides_mm2,
+            "kept_mm2": self.kept_mm2,
             "regions": [one.to_dict() for one in self.regions],
+            "kinds": [one.to_dict() for one in self.kinds],
         }
+
+    @classmethod
+    def from_dict(cls, kept: Mapping[str, Any]) -> "Outcome":
+        """As `to_dict` told it, with the places of `missed_mm` where they are there too.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError : it was not told so.
+        """
+        regions = tuple(
+            RegionOutcome(
+                UNSEEN if one["region"] is None else int(one["region"]),
+                float(one["promised_mm2"]),
+                float(one["reached_mm2"]),
+            )
+            for one in kept["regions"]
+        )
+        kinds = tuple(
+            KindOutcome(Evidence[str(one["evidence"]).upper()], float(one["asked_mm2"]), float(one["kept_mm2"]))
+            for one in kept.get("kinds", ())
+        )
+        missed = np.array(kept.get("missed_mm", ()), dtype=np.float64).reshape(-1, 3)
+        return cls(regions, missed, kinds, float(kept.get("kept_mm2", 0.0)), float(kept.get("besides_mm2", 0.0)))
 
 
 def reckon(
@@ -74,8 +124,8 @@ def reckon(
     """Compare the map before and after a pass.
 
     Good surface is a cell less than half of whose points fail, each side of a thin wall for itself. What is good after
-    the pass and lies near no cell that was good before is reached; it is given to the region of the
-    nearest place that was to be served.
+    the pass and lies near no cell that was good before is reached where it lies beside a place that was to be served,
+    and is given to the region of the nearest of these; elsewhere it was found besides.
     """
     old = know_surface(before, *failing_points(before_report), cell_mm)
     new = know_surface(after, *failing_points(after_report), cell_mm)
@@ -87,37 +137,34 @@ def reckon(
         tree = cKDTree(_facing(old_good, old_normals, 0.5 * cell))
         near, _ = tree.query(_facing(new_good, new_normals, 0.5 * cell), distance_upper_bound=_SAME * cell)
         fresh = ~np.isfinite(near)
-    owner = np.full(len(new_good), UNSEEN, dtype=np.int64)
+    owner = np.full(len(new_good), _NOBODY, dtype=np.int64)
     missed = np.ones(len(done.places_mm), dtype=np.bool_)
     if len(done.places_mm) and len(new_good):
         away, which = cKDTree(done.places_mm).query(new_good)
-        owner = np.where(away <= _BESIDE * cell, done.place_regions[np.minimum(which, len(missed) - 1)], UNSEEN)
-        tree = cKDTree(_facing(new_good, new_normals, 0.8 * cell))
-        near, _ = tree.query(_facing(done.places_mm, done.place_normals, 0.8 * cell), distance_upper_bound=1.2 * cell)
-        missed = ~np.isfinite(near)
+        owner = np.where(away <= _BESIDE_MM, done.place_regions[np.minimum(which, len(missed) - 1)], _NOBODY)
+        if fresh.any():  # what was good before was not asked for
+            tree = cKDTree(_facing(new_good[fresh], new_normals[fresh], 0.8 * cell))
+            places = _facing(done.places_mm, done.place_normals, 0.8 * cell)
+            missed = ~np.isfinite(tree.query(places, distance_upper_bound=_THERE * cell)[0])
     regions = []
-    for region in np.unique(np.concatenate([done.place_regions, owner[fresh]])):
+    for region in np.unique(done.place_regions):
         promised = float(done.place_mm2[done.place_regions == region].sum())
         regions.append(RegionOutcome(int(region), promised, float(new_mm2[fresh & (owner == region)].sum())))
     regions.sort(key=lambda one: -one.promised_mm2)
-    return Outcome(tuple(regions), done.places_mm[missed])
+    besides = float(new_mm2[fresh & (owner == _NOBODY)].sum())
+    kept_mm2 = float(done.place_area_mm2[~missed].sum())
+    return Outcome(tuple(regions), done.places_mm[missed], _kinds(done, ~missed), kept_mm2, besides)
 
 
-def trust_of(earlier: Sequence[tuple[float, float, float]]) -> float:
-    """How much of what passes promise is reached: by how much the next promises are multiplied.
-
-    Parameters
-    ----------
-    earlier : the area promised and reached by each earlier pass, and the trust that was in its promise.
-
-    Notes
-    -----
-    The median of the last few, so that one pass in vain does not spoil it, within bounds.
-    """
-    ratios = [reached * trust / promised for promised, reached, trust in earlier if promised > _LEAST_MM2]
-    if not ratios:
-        return 1.0
-    return float(np.clip(np.median(ratios[-_RECENT:]), *_TRUST))
+def _kinds(done: RecommendedPass, kept: BoolArray) -> tuple[KindOutcome, ...]:
+    """By kind of evidence, what was asked for before the chances of that kind came in, and the area that is good."""
+    found = []
+    for kind in Evidence:
+        mine = done.place_evidence == kind
+        if mine.any():
+            asked = done.place_mm2 / (done.trust * done.chances[kind])
+            found.append(KindOutcome(kind, float(asked[mine].sum()), float(done.place_area_mm2[mine & kept].sum())))
+    return tuple(found)
 
 
 def _good(surface: KnownSurface) -> tuple[Float64Array, Float64Array, Float64Array]:

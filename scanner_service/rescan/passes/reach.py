@@ -12,8 +12,8 @@ from drivers.scanline import Float64Array, Pose, read_only
 from scanner_service.rescan.passes.errors import PassOutOfReach, RigUnlimited
 from scanner_service.rescan.passes.motion import Motion, StraightMotion, TurningMotion
 
-_ROLLS = 4
-_TILTS_DEG = ((0.0, 1), (25.0, 8), (45.0, 12), (65.0, 12), (90.0, 12), (115.0, 12), (140.0, 8), (180.0, 1))
+_ROLLS = 8
+_STEP_RAD = math.radians(12.0)
 _PART_TURNS_DEG = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
 _PART_TIPS_DEG = (0.0, 30.0, 50.0)
 
@@ -119,7 +119,7 @@ class Reach:
         if attitude.motion is not None:
             return ()
         found = []
-        for axis, angle_deg in ((0, 9.0), (0, -9.0), (1, 9.0), (1, -9.0), (2, 20.0), (2, -20.0)):
+        for axis, angle_deg in ((0, 5.0), (0, -5.0), (1, 5.0), (1, -5.0), (2, 15.0), (2, -15.0)):
             rotation = attitude.rotation @ _about(axis, math.radians(angle_deg))
             if self.tilt_rad(rotation) <= self.max_tilt_rad + 1e-9:
                 found.append(Attitude(rotation, None))
@@ -181,16 +181,17 @@ class Reach:
             )
 
     def _free(self) -> Iterator[Float64Array]:
-        """Rotations that tilt z from `up` in rings, each with several turns about z."""
+        """Rotations that tilt z from `up` in rings a step apart, the last at the limit, each with turns about z."""
         base = _frame_of(self.up)
-        for tilt_deg, around in _TILTS_DEG:
-            if math.radians(tilt_deg) > self.max_tilt_rad + 1e-9:
-                break
+        rings = max(1, math.ceil(self.max_tilt_rad / _STEP_RAD - 1e-9))
+        for ring in range(rings + 1):
+            tilt = self.max_tilt_rad * ring / rings
+            around = max(1, round(2.0 * math.pi * math.sin(tilt) / _STEP_RAD))
             for step in range(around):
+                azimuth = 2.0 * math.pi * step / around
                 for roll in range(_ROLLS):
-                    azimuth = 2.0 * math.pi * step / around
                     turn = 2.0 * math.pi * roll / _ROLLS
-                    yield base @ _about(2, azimuth) @ _about(1, math.radians(tilt_deg)) @ _about(2, turn)
+                    yield base @ _about(2, azimuth) @ _about(1, tilt) @ _about(2, turn)
 
     def _turning(self) -> TurningMotion:
         table = self.rig.turntable

@@ -1,14 +1,15 @@
 """One recommended pass as it is told: where, how, how long, what for and with what result to expect; plans none."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from drivers.rig_limits import lines_between
 from drivers.scanline import Float64Array, Pose, read_only
 from scanner_service.rescan.passes.motion import Motion, StraightMotion
-from scanner_service.rescan.passes.needs import UNSEEN
+from scanner_service.rescan.passes.needs import FIRST_CHANCES, UNSEEN, Chances
 from scanner_service.rescan.passes.reach import PartTurn
 
 
@@ -42,9 +43,10 @@ class RecommendedPass:
 
     `duration_s` is the time of the pass itself, `approach_s` the time to get there (turning the part included);
     `promises` what it is to give, region by region; `gain_mm2` their sum. `places_mm` (k, 3) are the places served,
-    `place_regions` (k,) their regions, `place_mm2` (k,) their areas and `place_normals` (k, 3) where they
-    face; they are kept for the reckoning afterwards.
-    `turn` is what the operator does first; `trust` is what the promises were multiplied by, from earlier outcomes.
+    `place_regions` (k,) their regions, `place_evidence` (k,) why they are believed in, `place_area_mm2` (k,) their
+    areas, `place_mm2` (k,) what of these is promised, and `place_normals` (k, 3) where they face; they are kept for the
+    reckoning afterwards. `turn` is what the operator does first; `chances` (by evidence) and `trust` are what
+    the promises were multiplied by, from earlier outcomes.
     """
 
     number: int
@@ -59,12 +61,18 @@ class RecommendedPass:
     places_mm: Float64Array
     place_regions: Float64Array
     place_mm2: Float64Array
+    place_area_mm2: Float64Array
+    place_evidence: Float64Array
     place_normals: Float64Array
     turn: PartTurn | None = None
+    chances: Chances = FIRST_CHANCES
     trust: float = 1.0
 
     def __post_init__(self) -> None:
-        for array in (self.places_mm, self.place_regions, self.place_mm2, self.place_normals):
+        for array in (
+            self.places_mm, self.place_regions, self.place_mm2, self.place_area_mm2, self.place_evidence,
+            self.place_normals,
+        ):  # fmt: skip
             read_only(array)
 
     @property
@@ -143,12 +151,16 @@ class Plan:
     """Recommended passes of one version of the map, the best for its time first, and what none of them can bring.
 
     `needed_mm2` is all that is still wanted, `promised_mm2` what the listed passes are to bring of it.
+    `reachable_regions` are those of which some pose sees something; `lost_regions` those of which nothing can be
+    brought, with the reason.
     """
 
     version: int
     passes: tuple[RecommendedPass, ...]
     unreachable: tuple[Unreachable, ...]
     needed_mm2: float
+    reachable_regions: frozenset[int] = frozenset()
+    lost_regions: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def promised_mm2(self) -> float:

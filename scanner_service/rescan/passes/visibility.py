@@ -10,7 +10,7 @@ from scanner_service.rescan.passes.known_surface import KnownSurface
 from scanner_service.rescan.passes.marching import clear_sights, clear_ways
 from scanner_service.rescan.passes.motion import Sights
 
-DIRECTIONS = 480  # about 9 degrees apart
+DIRECTIONS = 900  # about 7 degrees apart
 
 
 def directions_everywhere(count: int = DIRECTIONS) -> Float64Array:

@@ -2,7 +2,7 @@
 
 import { byId, element } from "./element.js";
 import { plural, significant } from "./numbers.js";
-import { acceptPass, carryOut, endLoop, listOrders, listPasses, loopState, startLoop } from "./service.js";
+import { acceptPass, cancelOrder, carryOut, endLoop, listOrders, listPasses, loopState, startLoop } from "./service.js";
 
 const unit = (text) => element("span.unit", {}, text);
 
@@ -86,6 +86,7 @@ export class PassesPanel {
       {},
       element("span", {}, `Order ${order}: ${said}`),
       status === "accepted" ? element("button", { type: "button", onclick: go }, pass.turn_part ? "The part is turned: carry out" : "Carry out (laser on)") : null,
+      status === "accepted" ? element("button.quiet", { type: "button", onclick: () => this.#act(() => cancelOrder(this.#id, order)) }, "Cancel") : null,
     );
   }
 }

@@ -59,6 +59,7 @@ const send = (path, body, method = "POST") => answer(path, { method, headers: { 
 
 export const acceptPass = (id, number) => answer(sessionPath(id, `recommended-passes/${number}/accept`), { method: "POST" });
 
+export const cancelOrder = (id, order) => answer(sessionPath(id, `pass-orders/${order}`), { method: "DELETE" });
 export const carryOut = (id, order, turned) => send(sessionPath(id, `pass-orders/${order}/carry-out`), { part_is_turned: turned });
 
 export const startLoop = (id) => send(sessionPath(id, "rescan"), {});

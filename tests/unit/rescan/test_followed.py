@@ -70,6 +70,25 @@ def test_a_region_whose_points_wait_is_not_called_resolved() -> None:
     assert len(book.current) == 2 and not book.resolved
 
 
+def _cliff(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.where(y < 7.0, 0.0, 6.0)
+
+
+def test_a_shadow_is_not_resolved_by_a_pass_that_brought_nothing_to_its_surface() -> None:
+    book, scan = RegionBook(), straight_down(_cliff, X, Y, 0.3)
+    snapshot = replace(snapshot_of(scan), version=1)
+    shadows = [region for region in find_regions(snapshot).regions if region.reason is Reason.SHADOW]
+    assert shadows
+    book.follow(snapshot, shadows)
+    again = straight_down(_cliff, X, Y + 0.15, 0.3, pass_number=2)  # sees top and floor once more, and no wall
+    after = replace(snapshot_of(scan.joined(again)), version=2)
+    book.follow(after, [])  # no verdict finds the wall any more
+    assert [region.status for region in book.current] == [RegionStatus.RESCANNED] * len(shadows)
+    assert "no points" in book.current[0].history[-1].why
+    book.follow(replace(after, version=3), [])
+    assert len(book.current) == len(shadows)  # nor is it forgotten later
+
+
 def test_unreachable_is_said_with_a_reason_and_an_old_report_changes_nothing() -> None:
     book, scan = RegionBook(), straight_down(_ramps, X, Y, 0.3)
     _followed(book, scan, 5)

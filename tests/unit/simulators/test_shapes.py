@@ -186,3 +186,16 @@ def test_shapes_that_make_no_solid_are_refused() -> None:
         Cylinder((1.0, 1.0, 1.0), (1.0, 1.0, 1.0), 2.0)
     with pytest.raises(ValueError, match="longer than zero"):
         Polyhedron(np.zeros((1, 3)), np.zeros(1))
+
+
+def test_the_end_of_a_part_that_the_ray_misses_gives_no_normal() -> None:
+    low = box((-20.0, 8.0, 0.0), (20.0, 34.0, 14.0))
+    beside = box((-20.0, 34.0, 0.0), (2.0, 50.0, 14.0))  # its end lies in the same plane as that of the other
+    way = np.array([-0.6, -0.8, 0.0])  # leaves by x = -20 before it comes to the other
+    at = np.array([[-20.0, y, 7.0] for y in np.linspace(37.0, 46.0, 8)])
+    origins = np.vstack([at - 1.5 * way, [-30.0, 20.0, 7.0]])  # and a ray through the other
+    ways = np.vstack([np.broadcast_to(way, at.shape), [1.0, 0.0, 0.0]])
+    for solid in (Union(low, beside), Union(beside, low)):
+        distance, normals = solid.first_hit(origins, ways)
+        assert distance[:-1] == pytest.approx(1.5)
+        assert normals == pytest.approx(np.broadcast_to([-1.0, 0.0, 0.0], normals.shape))

@@ -67,8 +67,7 @@ def test_the_density_foretold_is_the_density_that_the_simulator_gives(tilt_deg):
     a = math.radians(tilt_deg)
     turn = np.array([[1, 0, 0], [0, math.cos(a), -math.sin(a)], [0, math.sin(a), math.cos(a)]])
     motion = StraightMotion(Pose(turn, place[0] - 0.0 * turn[:, 2]), turn[:, 1].copy())
-    one = np.zeros(1, dtype=np.int64)
-    needs = Needs(place, np.array([[0.0, 0.0, 1.0]]), np.ones(1), one, one.copy(), np.ones(1), np.ones(1))
+    needs = Needs.plain(place, np.array([[0.0, 0.0, 1.0]]), np.ones(1))
     foretold = prospect_of(surface, needs, motion, OPTICS).per_line_mm[0] / 0.3
     fresh = Bench(plate().surface)
     lines = list(fresh.posed.scan(motion.part_from_sensor, -6.0, 6.0, 0.3))
@@ -85,8 +84,7 @@ def test_what_is_foretold_to_be_seen_is_seen_and_the_shadow_is_not():
     y = np.arange(4.0, 19.5, 0.5)
     places = np.column_stack([np.zeros_like(y), y, np.zeros_like(y)])
     up = np.tile([0.0, 0.0, 1.0], (len(y), 1))
-    flat = np.zeros(len(y), dtype=np.int64)
-    needs = Needs(places, up, np.ones(len(y)), flat, flat.copy(), np.ones(len(y)), np.ones(len(y)))
+    needs = Needs.plain(places, up, np.ones(len(y)))
     prospect = prospect_of(surface, needs, FROM_ABOVE, OPTICS)
     shadow = y > 20.0 - 5.0 * math.tan(math.radians(27.0))  # the camera stands at +y, the step is 5 mm high
     clear = np.abs(y - (20.0 - 5.0 * math.tan(math.radians(27.0)))) > 2.0 * surface.cell_mm
@@ -175,10 +173,8 @@ def test_optics_that_cannot_be_meant_are_refused():
 
 
 def wanted_pass():
-    nothing = np.zeros((0, 3))
-    return RecommendedPass(
-        1, FROM_ABOVE, 0.0, 40.0, 0.2, 50.0, 4.0, 0.0, (), nothing, np.zeros(0), np.zeros(0), nothing.copy()
-    )  # fmt: skip
+    nothing, none = np.zeros((0, 3)), (np.zeros(0) for _ in range(4))
+    return RecommendedPass(1, FROM_ABOVE, 0.0, 40.0, 0.2, 50.0, 4.0, 0.0, (), nothing, *none, nothing.copy())
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,19 @@
 """From a judged map to passes: what they mend when they are carried out, and what is said to be out of reach."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from drivers.scanline import Pose
+from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.looks import look_of
 from scanner_service.rescan.passes.marching import FREE, HIDDEN
 from scanner_service.rescan.passes.outcome import reckon
-from scanner_service.rescan.passes.planner import TRIES, Tried, Wishes, plan_passes
+from scanner_service.rescan.passes.planner import Wishes, plan_passes
+from scanner_service.rescan.passes.serving import Serving
+from scanner_service.rescan.passes.tried import TRIES, Tried
 from simulators.parts import plate, sphere, step
 from tests.unit.rescan.passes.posed_scans import (
     DENSITY,
@@ -49,8 +54,10 @@ def test_the_shadow_of_a_step_is_seen_from_another_side():
     bench = Bench(step().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.25)
     snapshot, report = bench.judged()
     assert any(region.reason.label == "shadow" for region in report.regions)
+    shadows = dataclasses.replace(WISHES, serving=Serving(reasons=frozenset({Reason.SHADOW})))
+    first = plan_passes(snapshot, report, free_reach(), OPTICS, shadows).passes[0]
     plan = plan_passes(snapshot, report, free_reach(), OPTICS, WISHES)
-    towards = plan.passes[0].start_pose.rotation[:, 2]
+    towards = first.start_pose.rotation[:, 2]
     assert towards @ np.array([0.0, -1.0, 1.0]) > 0.7  # from before the step, where its wall is seen
     gained = sum(carried_out(bench, one).reached_mm2 for one in plan.passes)
     assert gained > 150.0  # the wall alone has 40 mm x 5 mm

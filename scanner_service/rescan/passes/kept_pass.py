@@ -1,0 +1,107 @@
+"""A recommended pass as the record keeps it, and back again; believes no length that it has not counted."""
+
+import base64
+import binascii
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from drivers.scanline import Float64Array, Pose
+from scanner_service.rescan.passes.motion import Motion, StraightMotion, TurningMotion
+from scanner_service.rescan.passes.needs import Evidence
+from scanner_service.rescan.passes.reach import PartTurn
+from scanner_service.rescan.passes.recommendation import Promise, RecommendedPass, pose_dict
+
+_COLUMNS = 10  # a place (3), where it faces (3), what is promised of it, its area, its region, its evidence
+_MOST_PLACES = 20_000
+
+
+def keep_pass(one: RecommendedPass) -> dict[str, Any]:
+    """Everything of a pass as JSON; the places it serves as base64 of float32 rows."""
+    rows = np.column_stack(
+        [
+            one.places_mm, one.place_normals, one.place_mm2, one.place_area_mm2, one.place_regions, one.place_evidence,
+        ]
+    )  # fmt: skip
+    return {
+        "number": one.number,
+        "motion": keep_motion(one.motion),
+        "start_mm": one.start_mm,
+        "end_mm": one.end_mm,
+        "line_spacing_mm": one.line_spacing_mm,
+        "line_rate_hz": one.line_rate_hz,
+        "duration_s": one.duration_s,
+        "approach_s": one.approach_s,
+        "promises": [
+            [each.region, each.gain_mm2, each.density_per_mm2, each.incidence_rad, each.largest_incidence_rad]
+            for each in one.promises
+        ],
+        "places": base64.b64encode(rows.astype("<f4").tobytes()).decode("ascii"),
+        "turn": None if one.turn is None else [one.turn.about_vertical_rad, one.turn.tip_rad],
+        "chances": list(one.chances),
+        "trust": one.trust,
+    }
+
+
+def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
+    """The pass that `keep_pass` kept.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError : it was not kept so.
+    """
+    try:
+        raw = base64.b64decode(kept["places"], validate=True)
+    except binascii.Error as error:
+        raise ValueError(f"the places of a kept pass cannot be read: {error}") from None
+    if len(raw) % (4 * _COLUMNS) or len(raw) > 4 * _COLUMNS * _MOST_PLACES:
+        raise ValueError(f"the places of a kept pass have {len(raw)} bytes, which are no rows of {_COLUMNS} numbers")
+    rows = np.frombuffer(raw, dtype="<f4").reshape(-1, _COLUMNS).astype(np.float64)
+    numbers = {
+        name: float(kept[name])
+        for name in (
+            "start_mm", "end_mm", "line_spacing_mm", "line_rate_hz", "duration_s", "approach_s", "trust",
+        )
+    }  # fmt: skip
+    turn, chances = kept["turn"], tuple(map(float, kept["chances"]))
+    if len(chances) != len(Evidence):
+        raise ValueError(f"a kept pass has {len(chances)} chances, and there are {len(Evidence)} kinds of evidence")
+    return RecommendedPass(
+        number=int(kept["number"]),
+        motion=kept_motion(kept["motion"]),
+        promises=tuple(Promise(int(region), *map(float, told)) for region, *told in kept["promises"]),
+        places_mm=rows[:, :3].copy(),
+        place_normals=rows[:, 3:6].copy(),
+        place_mm2=rows[:, 6].copy(),
+        place_area_mm2=rows[:, 7].copy(),
+        place_regions=rows[:, 8].copy(),
+        place_evidence=rows[:, 9].copy(),
+        turn=None if turn is None else PartTurn(float(turn[0]), float(turn[1])),
+        chances=chances,
+        **numbers,
+    )
+
+
+def keep_motion(motion: Motion) -> dict[str, Any]:
+    """A motion as JSON."""
+    kept: dict[str, Any] = {"at_zero": pose_dict(motion.at_zero)}
+    if isinstance(motion, StraightMotion):
+        return kept | {"travel": motion.travel.tolist()}
+    return kept | {"axis": motion.axis.tolist(), "radius_mm": motion.radius_mm}
+
+
+def kept_motion(kept: Mapping[str, Any]) -> Motion:
+    """The motion that `keep_motion` kept; raises KeyError, TypeError or ValueError when it was not kept so."""
+    pose = kept["at_zero"]
+    at_zero = Pose(_numbers(pose["rotation"], (3, 3)), _numbers(pose["translation_mm"], (3,)))
+    if "travel" in kept:
+        return StraightMotion(at_zero, _numbers(kept["travel"], (3,)))
+    return TurningMotion(at_zero, _numbers(kept["axis"], (3,)), float(kept["radius_mm"]))
+
+
+def _numbers(kept: Any, shape: tuple[int, ...]) -> Float64Array:
+    found = np.array(kept, dtype=np.float64)
+    if found.shape != shape or not np.isfinite(found).all():
+        raise ValueError(f"{kept!r} is not {shape} finite numbers")
+    return found

@@ -1,0 +1,141 @@
+"""The orders of one session: passes that were accepted, how far each has come, and how they outlast a restart.
+
+Knows the record's events as values, no session, no planner and no thread.
+"""
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from scanner_service.rescan.passes.kept_pass import keep_pass, kept_pass
+from scanner_service.rescan.passes.outcome import Outcome
+from scanner_service.rescan.passes.recommendation import RecommendedPass
+from scanner_service.sessions.errors import PassUnknown, SessionBusy
+from scanner_service.storage.rows import EventRow
+
+_LOG = logging.getLogger(__name__)
+ACCEPTED, STARTED, CANCELLED, OUTCOME = "pass_accepted", "pass_started", "pass_cancelled", "pass_outcome"
+"""Events of the record, in the order of an order's life."""
+
+_ENDED = "the service ended while the pass was carried out"
+
+
+class PassStatus(StrEnum):
+    """How far an accepted pass has come."""
+
+    ACCEPTED = "accepted"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+@dataclass(slots=True)
+class PassOrder:
+    """A pass that was accepted: which one, how far it has come, and what became of it.
+
+    `map_passes` are the numbers that its scanlines have in the map, once it is done.
+    """
+
+    order_id: int
+    planned: RecommendedPass
+    version: int
+    status: PassStatus = PassStatus.ACCEPTED
+    outcome: Outcome | None = None
+    message: str | None = None
+    map_passes: list[int] = field(default_factory=list)
+
+    @property
+    def is_over(self) -> bool:
+        """True when nothing more will become of it."""
+        return self.status not in (PassStatus.ACCEPTED, PassStatus.RUNNING)
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {
+            "order": self.order_id,
+            "version": self.version,
+            "status": self.status.value,
+            "message": self.message,
+            "pass": self.planned.to_dict(),
+            "outcome": self.outcome.to_dict() if self.outcome else None,
+        }
+
+
+class OrderBook:
+    """All orders of a session, the oldest first; whoever owns it does the locking."""
+
+    def __init__(self) -> None:
+        self._orders: list[PassOrder] = []
+
+    def all(self) -> list[PassOrder]:
+        """The orders as they are now."""
+        return list(self._orders)
+
+    def take(self, planned: RecommendedPass, version: int) -> PassOrder:
+        """A new order."""
+        order = PassOrder(len(self._orders) + 1, planned, version)
+        self._orders.append(order)
+        return order
+
+    def get(self, order_id: int) -> PassOrder:
+        """One order; raises PassUnknown."""
+        if not 1 <= order_id <= len(self._orders):
+            raise PassUnknown(f"no pass order {order_id} was taken in this session; accept a recommended pass first")
+        return self._orders[order_id - 1]
+
+    def cancel(self, order_id: int, why: str) -> PassOrder:
+        """Give an order up that was not started; raises PassUnknown, or SessionBusy when it is too late for that."""
+        order = self.get(order_id)
+        if order.status is not PassStatus.ACCEPTED:
+            hint = "stop the session to end it" if order.status is PassStatus.RUNNING else "it is over"
+            raise SessionBusy(f"pass order {order_id} is {order.status.value} and cannot be cancelled: {hint}")
+        order.status, order.message = PassStatus.CANCELLED, why
+        return order
+
+    def restore(self, events: Iterable[EventRow]) -> None:
+        """Go on where the events of an earlier service end; what it was just carrying out has failed.
+
+        An event that cannot be read ends it: orders are numbered, and none may take another's number.
+        """
+        for event in events:
+            try:
+                self._replay(event.kind, event.details)
+            except (KeyError, TypeError, ValueError, PassUnknown) as error:
+                _LOG.warning("the pass orders of a session cannot be read beyond event %s: %s", event.kind, error)
+                break
+        for order in self._orders:
+            if order.status is PassStatus.RUNNING:
+                order.status, order.message = PassStatus.FAILED, _ENDED
+
+    def _replay(self, kind: str, details: Mapping[str, Any]) -> None:
+        if kind == ACCEPTED and "kept" in details:
+            if int(details["order"]) != len(self._orders) + 1:
+                raise ValueError(f"order {details['order']} follows on order {len(self._orders)}")
+            self.take(kept_pass(details["kept"]), int(details["version"]))
+        elif kind in (STARTED, CANCELLED, OUTCOME):
+            order = self.get(int(details["order"]))
+            if kind == STARTED:
+                order.status = PassStatus.RUNNING
+            elif kind == CANCELLED:
+                order.status, order.message = PassStatus.CANCELLED, details.get("message")
+            else:
+                order.status, order.message = PassStatus(details["status"]), details.get("message")
+                order.map_passes = [int(number) for number in details.get("map_passes", ())]
+                if details.get("outcome"):
+                    order.outcome = Outcome.from_dict(details["outcome"])
+
+
+def accepted_event(order: PassOrder) -> dict[str, Any]:
+    """What the record keeps of an order that was taken."""
+    return order.to_dict() | {"kept": keep_pass(order.planned)}
+
+
+def outcome_event(order: PassOrder) -> dict[str, Any]:
+    """What the record keeps of an order that is over, its missed places included."""
+    told = order.to_dict()
+    if order.outcome is not None:
+        told["outcome"] = order.outcome.to_dict() | {"missed_mm": order.outcome.missed_mm.round(2).tolist()}
+    return told | {"map_passes": order.map_passes}

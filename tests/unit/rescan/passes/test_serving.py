@@ -1,0 +1,122 @@
+"""Plans for named regions and reasons, for more than density, and for the nominal part; passes kept and read again."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from scanner_service.rescan.judgement import Reason
+from scanner_service.rescan.passes.kept_pass import keep_pass, kept_pass
+from scanner_service.rescan.passes.motion import TurningMotion
+from scanner_service.rescan.passes.needs import UNSEEN
+from scanner_service.rescan.passes.planner import Wishes, plan_passes
+from scanner_service.rescan.passes.serving import Serving
+from scanner_service.rescan.reference import ReferenceSurface, reference_coverage
+from scanner_service.rescan.requirement import Requirement
+from simulators.parts import step
+from tests.unit.rescan.passes.posed_scans import DENSITY, FROM_ABOVE, OPTICS, Bench, free_reach, linear_reach
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    """A step scanned too coarsely from above: sparse everywhere, with a shadow at its foot."""
+    return Bench(step().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.6).judged()
+
+
+def served_regions(plan):
+    return {promise.region for one in plan.passes for promise in one.promises}
+
+
+def test_named_reasons_alone_are_served(coarse):
+    _, report = coarse
+    reason_of = {region.number: region.reason for region in report.regions}
+    assert {Reason.SPARSE, Reason.SHADOW} <= set(reason_of.values())
+    everything = plan_passes(*coarse, free_reach(), OPTICS, Wishes(DENSITY, max_passes=4))
+    assert UNSEEN in served_regions(everything)
+    named = Serving(reasons=frozenset({Reason.SHADOW}))
+    shadows = plan_passes(*coarse, free_reach(), OPTICS, Wishes(DENSITY, max_passes=4, serving=named))
+    assert served_regions(shadows)
+    assert {reason_of[number] for number in served_regions(shadows)} == {Reason.SHADOW}
+    assert shadows.needed_mm2 < everything.needed_mm2
+
+
+def test_a_named_region_alone_is_served(coarse):
+    _, report = coarse
+    largest = max(report.regions, key=lambda region: region.area_mm2)
+    named = Serving(regions=frozenset({largest.number}))
+    plan = plan_passes(*coarse, free_reach(), OPTICS, Wishes(DENSITY, max_passes=2, serving=named))
+    assert served_regions(plan) == {largest.number}
+
+
+def test_lines_lie_as_close_as_line_spacing_and_incidence_ask(coarse):
+    snapshot, _ = coarse
+    loose = plan_passes(*coarse, linear_reach(), OPTICS, Wishes(2.0, max_passes=1))
+    fine = Requirement(density_per_mm2=2.0, line_spacing_mm=0.15)
+    asked = plan_passes(*coarse, linear_reach(), OPTICS, Wishes(2.0, max_passes=1, requirement=fine))
+    assert not loose.passes or loose.passes[0].line_spacing_mm > 0.15
+    assert asked.passes[0].line_spacing_mm <= 0.15
+    steep = Requirement(density_per_mm2=DENSITY, incidence_rad=np.radians(20.0))
+    plan = plan_passes(*coarse, free_reach(), OPTICS, Wishes(DENSITY, max_passes=3, requirement=steep))
+    assert plan.passes
+    assert all(p.largest_incidence_rad <= np.radians(20.0) + 1e-9 for one in plan.passes for p in one.promises)
+    assert len(snapshot)
+
+
+def box_corners(low, high):
+    """Twelve triangles of a box, wound counter-clockwise seen from outside."""
+    (x0, y0, z0), (x1, y1, z1) = low, high
+    quads = [
+        [(x0, y0, z0), (x0, y1, z0), (x1, y1, z0), (x1, y0, z0)],
+        [(x0, y0, z1), (x1, y0, z1), (x1, y1, z1), (x0, y1, z1)],
+        [(x0, y0, z0), (x1, y0, z0), (x1, y0, z1), (x0, y0, z1)],
+        [(x0, y1, z0), (x0, y1, z1), (x1, y1, z1), (x1, y1, z0)],
+        [(x0, y0, z0), (x0, y0, z1), (x0, y1, z1), (x0, y1, z0)],
+        [(x1, y0, z0), (x1, y1, z0), (x1, y1, z1), (x1, y0, z1)],
+    ]
+    return np.array([[q[a], q[b], q[c]] for q in quads for a, b, c in ((0, 1, 2), (0, 2, 3))], dtype=np.float64)
+
+
+def test_missing_nominal_surface_is_served_and_nothing_else_is_guessed():
+    from simulators.shapes import box
+
+    low, high = (-20.0, 0.0, -6.0), (20.0, 40.0, 0.0)
+    snapshot, report = Bench(box(low, high)).scan(FROM_ABOVE, -1.0, 20.0, 0.25).judged()  # the first half of its top
+    nominal = ReferenceSurface.of(box_corners(low, high))
+    requirement = Requirement(density_per_mm2=DENSITY)
+    coverage = reference_coverage(nominal, snapshot, report, requirement)
+    numbered = tuple(
+        dataclasses.replace(region, number=number)
+        for number, region in enumerate((*report.regions, *coverage.untouched), start=1)
+    )
+    plan = plan_passes(
+        snapshot, report, free_reach(), OPTICS, Wishes(DENSITY, max_passes=2), regions=numbered, reference=coverage
+    )
+    untouched = {region.number for region in numbered if region.reason is Reason.UNTOUCHED}
+    assert served_regions(plan) & untouched
+    first = plan.passes[0]
+    off = np.maximum(np.array(low) - first.places_mm, first.places_mm - np.array(high)).max(axis=1)
+    assert np.abs(off).max() < 1.0  # every place lies on the nominal part
+    assert first.gain_mm2 > 600.0  # the other half of its top
+    below = [one for one in plan.unreachable if "face" in one.why]
+    assert sum(one.area_mm2 for one in below) > 1400.0  # nobody looks at the underside
+
+
+def test_a_kept_pass_is_the_pass_that_was_kept(coarse):
+    one = plan_passes(*coarse, linear_reach(part_may_turn=True), OPTICS, Wishes(DENSITY, max_passes=1)).passes[0]
+    again = kept_pass(json.loads(json.dumps(keep_pass(one), allow_nan=False)))
+    assert again.to_dict() == one.to_dict()
+    assert again.places_mm == pytest.approx(one.places_mm, abs=1e-4)
+    assert again.place_mm2.sum() == pytest.approx(one.place_mm2.sum(), rel=1e-5)
+    turning = dataclasses.replace(one, motion=TurningMotion(one.motion.at_zero, np.array([0.0, 0.0, 1.0]), 20.0))
+    motion = kept_pass(keep_pass(turning)).motion
+    assert isinstance(motion, TurningMotion) and motion.radius_mm == 20.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("places", "AAAA"), ("places", "?"), ("motion", {"at_zero": None}), ("promises", [[1]])]
+)
+def test_what_was_not_kept_so_is_refused(coarse, name, value):
+    one = plan_passes(*coarse, linear_reach(), OPTICS, Wishes(DENSITY, max_passes=1)).passes[0]
+    with pytest.raises((ValueError, TypeError, KeyError)):
+        kept_pass(keep_pass(one) | {name: value})
