@@ -6,6 +6,7 @@ what changed, a page at a time between scanlines; all further work is done on th
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -68,7 +69,7 @@ class Mirror:
         copied = 0
         while True:
             since = self.version
-            news = ask(lambda live_map: _news_since(live_map, since))
+            news = ask(partial(_news_since, version=since))
             copied += len(news.rows)
             if news.records is not None:
                 if len(news.rows) or news.version != since or self._snapshot is None:
@@ -77,7 +78,7 @@ class Mirror:
                 return copied
             for start in range(0, len(news.rows), PAGE_ROWS):
                 rows = news.rows[start : start + PAGE_ROWS]
-                records = ask_between(lambda live_map, rows=rows: live_map.records(rows))  # type: ignore[misc]
+                records = ask_between(partial(LiveMap.records, rows=rows))
                 self._keep(_Kept(news.total, rows, records.describe()))
             self.version = news.version
 
