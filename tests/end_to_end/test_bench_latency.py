@@ -9,6 +9,7 @@ from benchmarks.latency import Answers, compare, lost_lines, main
 from benchmarks.prepared_scanner import PassPlan, Sent, leaving_times_s, prepare
 from drivers.protocols.native import Decoder, encode
 from drivers.protocols.native_messages import Chunk, EndOfPass, Hello, Keepalive, Laser, Start
+from tests.singles import apart
 
 
 def test_a_short_run_answers_every_line(tmp_path):
@@ -36,7 +37,7 @@ def test_a_prepared_scanner_says_what_a_scanner_says_that_measures_when_it_must(
     for step in range(8):
         now_s = 10.0 + step / 100
         data = device.transmit(now_s, 1 << 20)
-        heard += decoder.receive(data)
+        heard += apart(decoder.receive(data))
         total += len(data)
         written.append((now_s, total))
         device.receive(encode(Keepalive(20 + step)), now_s)

@@ -51,7 +51,7 @@ def test_the_power_cuts_find_out_a_writer_that_does_not_sync(mode):
 
 @under_sqlite
 def test_the_record_survives_a_sample_of_all_storage_faults():
-    account = inject(sample(30, seed=13))
+    account = inject(sample(40, seed=13))
     assert kept_everything(account), account
     assert account.met > 20
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from drivers.protocols.framing import MAX_BODY_BYTES, MAX_FRAME_BYTES, Damage, DamageReason, frame
 from drivers.protocols.native import MAX_POINTS_PER_CHUNK, Decoder, encode
 from drivers.protocols.native_messages import Chunk, Message, OtherVersion
+from tests.singles import apart
 from tests.vectors.native import FROM_DEVICE, FROM_HOST, WHOLE_FRAMES, crc32_bit_by_bit, frame_by_hand
 
 VECTORS = [(name, message, bytes.fromhex(body), False) for name, (message, body) in FROM_DEVICE.items()]
@@ -19,11 +20,6 @@ VECTORS += [(name, message, bytes.fromhex(body), True) for name, (message, body)
 DEVICE_FRAMES = [frame_by_hand(bytes.fromhex(body)) for _, body in FROM_DEVICE.values()]
 DEVICE_MESSAGES = [message for message, _ in FROM_DEVICE.values()]
 SPECIFICATION = Path(__file__).resolve().parents[3] / "docs" / "protocol.md"
-
-
-def apart(found: list[Message | Damage]) -> list[Message | Damage]:
-    """Every chunk for itself, however many were read in one go."""
-    return [single for item in found for single in (item.apart() if isinstance(item, Chunk) else (item,))]
 
 
 def same(a: Message | Damage, b: Message | Damage) -> bool:

@@ -28,6 +28,7 @@ from drivers.protocols.native_messages import (
 )
 from drivers.scanline import DeviceInfo, SensorGeometry
 from simulators.devices.native import END_REPEAT_S, NativeDevice
+from tests.singles import apart
 
 N_POINTS = 60
 INFO = DeviceInfo(
@@ -47,7 +48,7 @@ def new_device(**settings: float) -> NativeDevice:
 
 
 def hear(device: NativeDevice, now_s: float, room_bytes: int = 1_000_000) -> list[Message]:
-    found = Decoder().receive(device.transmit(now_s, room_bytes))
+    found = apart(Decoder().receive(device.transmit(now_s, room_bytes)))
     assert not [item for item in found if isinstance(item, Damage)]
     return [item for item in found if not isinstance(item, Damage)]
 
@@ -211,7 +212,7 @@ def test_a_slow_wire_makes_the_device_drop_and_count_every_chunk_it_drops(buffer
         stream += data
     device.receive(encode(HelloRequest(4)), len(rooms) * 0.02 - 0.01)
     stream += device.transmit(len(rooms) * 0.02 - 0.01, 10_000)
-    messages = Decoder().receive(stream)
+    messages = apart(Decoder().receive(stream))
     chunks = [item for item in messages if isinstance(item, Chunk)]
     hello = messages[-1]
     assert isinstance(hello, Hello)
