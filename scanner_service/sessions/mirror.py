@@ -5,7 +5,7 @@ what changed, a page at a time between scanlines; all further work is done on th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol, TypeVar
 
@@ -13,13 +13,12 @@ import numpy as np
 
 from scanner_service.analysis.describing import Records
 from scanner_service.analysis.live_map import LiveMap
-from scanner_service.analysis.snapshot import Int32Array, LineTable, MapSnapshot
+from scanner_service.analysis.points import POINT, PointArray, put_points
+from scanner_service.analysis.snapshot import Int32Array, MapSnapshot
 
 T = TypeVar("T")
 PAGE_ROWS = 50_000
 """The engine copies so many rows between two scanlines, in some two milliseconds."""
-
-_MOST_KEPT = 100_000  # rows
 
 
 class Ask(Protocol):
@@ -39,26 +38,19 @@ class _News:
     records: Records | None
 
 
-@dataclass(frozen=True, slots=True)
-class _Kept:
-    """Rows (m,) of a map of `total` points and what it says of them, not yet put in place."""
-
-    total: int
-    rows: Int32Array
-    points: MapSnapshot
-
-
 class Mirror:
     """A copy of one live map; one thread owns it.
 
-    What changed is kept until somebody asks for the map, or until it is worth a quarter of the map: then all of it is
-    put in place at once, so that copying costs the same a point however large the map is.
+    It holds the map's records as they are: a row is described once for each snapshot that somebody wants, not each
+    time it changes.
     """
 
     def __init__(self) -> None:
         self.version = 0
-        self._snapshot: MapSnapshot | None = None
-        self._kept: list[_Kept] = []
+        self._points: PointArray = np.empty(0, dtype=POINT)
+        self._place: Int32Array = np.empty(0, dtype=np.int32)
+        self._total = 0
+        self._latest: Records | None = None
 
     def catch_up(self, ask: Ask, ask_between: Ask) -> int:
         """Take in everything that the engine was given before this call; returns how many rows were copied.
@@ -68,49 +60,34 @@ class Mirror:
         """
         copied = 0
         while True:
-            since = self.version
-            news = ask(partial(_news_since, version=since))
+            news = ask(partial(_news_since, version=self.version))
+            self._make_room(news.total)
             copied += len(news.rows)
             if news.records is not None:
-                if len(news.rows) or news.version != since or self._snapshot is None:
-                    self._keep(_Kept(news.total, news.rows, news.records.describe()))
-                self.version = news.version
+                self._put(news.rows, news.records)
+                self.version, self._total = news.version, news.total
                 return copied
             for start in range(0, len(news.rows), PAGE_ROWS):
                 rows = news.rows[start : start + PAGE_ROWS]
-                records = ask_between(partial(LiveMap.records, rows=rows))
-                self._keep(_Kept(news.total, rows, records.describe()))
+                self._put(rows, ask_between(partial(LiveMap.records, rows=rows)))
             self.version = news.version
 
     def snapshot(self) -> MapSnapshot:
-        """The whole map as it was caught up with last, frozen; what was given before stays as it was."""
-        if self._kept:
-            self._put_in_place()
-        assert self._snapshot is not None
-        return self._snapshot
+        """The whole map as it was caught up with last, frozen; what is copied later does not change it."""
+        assert self._latest is not None
+        whole = slice(0, self._total)
+        return replace(self._latest, points=self._points[whole].copy(), place=self._place[whole].copy()).describe()
 
-    def _keep(self, change: _Kept) -> None:
-        self._kept.append(change)
-        if sum(len(kept.rows) for kept in self._kept) > max(_MOST_KEPT, change.total // 4):
-            self._put_in_place()
+    def _make_room(self, total: int) -> None:
+        """Room for so many rows, and for half as many more, so that a growing map is not copied every time."""
+        if total > len(self._points):
+            more = total + total // 2 - len(self._points)
+            self._points = np.concatenate([self._points, np.empty(more, dtype=POINT)])
+            self._place = np.concatenate([self._place, np.empty(more, dtype=np.int32)])
 
-    def _put_in_place(self) -> None:
-        old, kept = self._snapshot, self._kept
-        last = kept[-1]
-        renewed = {}
-        for item in fields(MapSnapshot):
-            part = getattr(last.points, item.name)
-            if isinstance(part, LineTable) or not isinstance(part, np.ndarray) or item.name == "origin_mm":
-                renewed[item.name] = part
-                continue
-            whole = np.empty((last.total, *part.shape[1:]), dtype=part.dtype)
-            if old is not None:
-                before = getattr(old, item.name)
-                whole[: len(before)] = before
-            for change in kept:
-                whole[change.rows] = getattr(change.points, item.name)
-            renewed[item.name] = whole
-        self._snapshot, self._kept = replace(last.points, **renewed), []
+    def _put(self, rows: Int32Array, records: Records) -> None:
+        put_points(self._points, self._place, rows, records.points, records.place)
+        self._latest = records
 
 
 def _news_since(live_map: LiveMap, version: int) -> _News:
