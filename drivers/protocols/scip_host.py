@@ -141,6 +141,7 @@ class ScipHost(Conversation):
         self._request: _Request | None = None
         self._angles_rad = np.empty(0)
         self._clock = DeviceClock(CLOCK_SPAN, CLOCK_TICK_S)
+        self._dropped_lines = 0  # scans that the lidar made and had no time to send
 
     # ---- scripts --------------------------------------------------------------------------------------------------
 
@@ -279,8 +280,8 @@ class ScipHost(Conversation):
             return
         device_time_s = self._clock.read(scan.timestamp, now_s)
         self._jumped(self._clock.jumps)
-        self._account.lost_by_time(device_time_s, self._period_s(request, parameters))
-        if not self._account.enter():
+        self._dropped_lines += self._account.lost_by_time(device_time_s, self._period_s(request, parameters))
+        if not self._account.enter(self._dropped_lines):
             return
         if scan.damaged_bytes:
             self._damage(Damage(DamageReason.BAD_SUM, scan.damaged_bytes))

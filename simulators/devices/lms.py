@@ -110,10 +110,17 @@ class LmsDevice:
             self._out += bytes([NAK])
 
     def transmit(self, now_s: float, room_bytes: int) -> bytes:
-        """At most `room_bytes` of what there is to send by now."""
+        """At most `room_bytes` of what there is to send by now.
+
+        What the line had time for since the last call was sent meanwhile: a scan finds the line as that leaves it.
+        """
         while self._later and self._later[0][0] <= now_s:
             self._out += self._later.popleft()[1]
+        sent = self._send(room_bytes)
         self._measure(now_s)
+        return sent + self._send(room_bytes - len(sent))
+
+    def _send(self, room_bytes: int) -> bytes:
         sent = bytes(self._out[:room_bytes])
         del self._out[:room_bytes]
         if not self._out and self._rate_after is not None:

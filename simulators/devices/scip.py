@@ -132,9 +132,16 @@ class ScipDevice:
                 self._obey(request, now_s)
 
     def transmit(self, now_s: float, room_bytes: int) -> bytes:
-        """At most `room_bytes` of what there is to send by now."""
+        """At most `room_bytes` of what there is to send by now.
+
+        What the line had time for since the last call was sent meanwhile: a scan finds the line as that leaves it.
+        """
         self._start_clock(now_s)
+        sent = self._send(room_bytes)
         self._measure(now_s)
+        return sent + self._send(room_bytes - len(sent))
+
+    def _send(self, room_bytes: int) -> bytes:
         while len(self._out) < room_bytes and self._rate_after is None and self._replies:
             answer, rate = self._replies.popleft()
             self._out += answer
