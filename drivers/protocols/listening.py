@@ -1,7 +1,7 @@
 """Time in which a program has listened, as against time that has passed; knows no clock and waits for nothing.
 
-A process that was stopped for a minute, by a debugger, a suspended machine or a busy one, has not listened for a minute:
-what was said meanwhile lies in the port's buffer, and its reader has not had its turn yet.
+A process that was stopped for a minute, by a debugger or a busy machine, has not listened for a minute: what was said
+meanwhile lies in the port's buffer, and its reader has not had its turn yet.
 """
 
 LISTENED_S = 0.25

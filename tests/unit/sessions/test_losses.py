@@ -54,7 +54,7 @@ class RestlessWire:
             if not is_lost:
                 self._account.chunk(number, number, 0, 0)
                 self._account.line_closed(whole=True)
-                self._sink.line(scanline(ROW_MM + [0.0, 0.2 * number, 0.0], number))
+                self._sink.line(scanline(ROW_MM + np.array([0.0, 0.2 * number, 0.0]), number))
 
 
 @pytest.fixture(scope="module")
