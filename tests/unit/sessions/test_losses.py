@@ -1,5 +1,7 @@
 """What a session tells of its losses balances in every answer, however wire, session and record run on meanwhile."""
 
+import time
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -25,7 +27,7 @@ class RestlessWire:
         self.info = DeviceInfo("A", "M", "F", "C", 1, 20, GEOMETRY)
         self._meanwhile = meanwhile
         self._account = BootLedger(boot_id=1)
-        self._next = 0
+        self._next = self._delivered = 0
 
     def start(self, sink):
         self._sink = sink
@@ -55,6 +57,10 @@ class RestlessWire:
                 self._account.chunk(number, number, 0, 0)
                 self._account.line_closed(whole=True)
                 self._sink.line(scanline(ROW_MM + np.array([0.0, 0.2 * number, 0.0]), number))
+                self._delivered += 1
+        ledger = self._sink.engine.ledger
+        while (now := ledger.snapshot()).received < self._delivered or now.pending:  # until their fate is known
+            time.sleep(0.001)
 
 
 @pytest.fixture(scope="module")
