@@ -58,8 +58,7 @@ class RestlessWire:
                 self._account.line_closed(whole=True)
                 self._sink.line(scanline(ROW_MM + np.array([0.0, 0.2 * number, 0.0]), number))
                 self._delivered += 1
-        ledger = self._sink.engine.ledger
-        while (now := ledger.snapshot()).received < self._delivered or now.pending:  # until their fate is known
+        while self._sink.engine.ledger.snapshot().received < self._delivered:  # until the session has heard of all
             time.sleep(0.001)
 
 
