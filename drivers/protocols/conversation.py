@@ -16,6 +16,7 @@ import numpy as np
 from drivers.errors import ScannerError, ScannerNotConnected, ScannerRefused
 from drivers.protocols.dialogue import Script
 from drivers.protocols.framing import Damage
+from drivers.protocols.listening import listened_s
 from drivers.protocols.profile_account import ProfileAccount
 from drivers.protocols.scanner_events import (
     Advice,
@@ -91,7 +92,7 @@ class Conversation(Talk):
         self._resume = False
         self._other_id = ""
         self._lost_s: float | None = None
-        self._profile_s = 0.0
+        self._profile_s = self._looked_s = 0.0
         self._in_trouble: str | None = None
 
     # ---- what a protocol brings -----------------------------------------------------------------------------------
@@ -145,6 +146,13 @@ class Conversation(Talk):
             self._wanted = False
             self._pass_ended("disconnected")
             self._emit(PassNotResumed("the link was lost, and this pass was not to go on by itself"))
+
+    def tick(self, now_s: float) -> None:
+        """Do what is due by now; while this program was not let run, no profile can have been missed."""
+        not_listened_s = now_s - self._looked_s - listened_s(self._looked_s, now_s)
+        self._profile_s = min(now_s, self._profile_s + max(0.0, not_listened_s))
+        self._looked_s = now_s
+        super().tick(now_s)
 
     def end(self) -> None:
         """The port will be closed in good order; nobody is told."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar
 
 from drivers.errors import ScannerError
+from drivers.protocols.listening import listened_s
 
 T = TypeVar("T")
 
@@ -54,7 +55,8 @@ class Dialogue:
         self._done = done
         self._failed = failed
         self._wait: Wait | None = None
-        self._since_s = self._heard_s = now_s
+        self._since_s = self._heard_s = self._ticked_s = now_s
+        self._listened_s = 0.0
         self.is_over = False
 
     def begin(self, now_s: float) -> None:
@@ -73,10 +75,12 @@ class Dialogue:
         return False
 
     def tick(self, now_s: float) -> None:
-        """Go on where the wait is over by now."""
+        """Go on where the wait is over by now; for an answer only the time counts in which it could be heard."""
         waited_s = now_s - self._since_s
+        self._listened_s += listened_s(max(self._ticked_s, self._since_s), now_s)
+        self._ticked_s = now_s
         match self._wait:
-            case Answer(within_s=within_s) if waited_s >= within_s:
+            case Answer(within_s=within_s) if self._listened_s >= within_s:
                 self._go_on(None, now_s)
             case Pause(for_s=for_s) if waited_s >= for_s:
                 self._go_on(None, now_s)
@@ -93,6 +97,7 @@ class Dialogue:
 
     def _go_on(self, answer: object, now_s: float) -> None:
         self._since_s = now_s
+        self._listened_s = 0.0
         self._wait = None
         try:
             wait = self._script.send(answer)

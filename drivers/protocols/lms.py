@@ -53,6 +53,8 @@ class Mode(IntEnum):
     INSTALLATION = 0x00
     STREAM = 0x24
     ON_REQUEST = 0x25
+    STREAM_PARTIAL = 0x2A
+    """Each turn's values as they are measured, where a whole scan is put together of several turns."""
     RATE_38400 = 0x40
     RATE_19200 = 0x41
     RATE_9600 = 0x42

@@ -63,11 +63,14 @@ class LmsOptions:
         100 degrees, 25. None takes what is set.
     work_rate : baud rate to switch to where the scanner answers at a lower one; 500,000 needs RS-422. None stays.
     field_of_view_rad : (lowest, highest) angle that is handed on, 0 ahead, counter-clockwise; None is all.
+    partial_scans : take the values of each turn of the mirror as a profile of its own, a degree apart, instead of whole
+        scans that are put together of two or four turns. A moving part is then not smeared over several turns.
     """
 
     variant: tuple[int, int] | None = None
     work_rate: int | None = 38_400
     field_of_view_rad: tuple[float, float] | None = None
+    partial_scans: bool = False
 
     def __post_init__(self) -> None:
         if self.work_rate is not None and self.work_rate not in RATE_MODES:
@@ -122,7 +125,8 @@ class LmsHost(Conversation):
         if status.has_fault:
             self._advise("the scanner reports a fault of its own; see the lamps on its front")
         self._status = status
-        self._scan_s = TURN_S * {100: 1, 50: 2, 25: 4}.get(status.resolution_hundredths, 1)
+        turns = 1 if self._options.partial_scans else {100: 1, 50: 2, 25: 4}.get(status.resolution_hundredths, 1)
+        self._scan_s = TURN_S * turns
         self._clock = DeviceClock(_INDEX_SPAN, self._scan_s) if not self.is_met else self._clock
         self.laser_on = True  # it measures for as long as it has power
         name, part, firmware = (
@@ -137,7 +141,11 @@ class LmsHost(Conversation):
             firmware=firmware.strip() or status.software,
             calibration_id="factory",
             boot_id=self.boot_id,
-            points_per_line=status.angle_deg * 100 // status.resolution_hundredths + 1,
+            points_per_line=(
+                status.angle_deg + 1
+                if self._options.partial_scans
+                else status.angle_deg * 100 // status.resolution_hundredths + 1
+            ),
             geometry=SensorGeometry(np.zeros(3), np.zeros(3), (-8191.0 * UNITS_MM.get(status.unit, 10.0), 0.0), 0.0),
         )
 
@@ -223,7 +231,8 @@ class LmsHost(Conversation):
                 "or a coarser resolution"
             )
         self.silent_after_s = max(2.0, 5 * max(wire_s, self._scan_s))
-        answer = yield from self._request(mode_request(Mode.STREAM), Command.MODE, within_s=_MODE_S)
+        mode = Mode.STREAM_PARTIAL if self._options.partial_scans else Mode.STREAM
+        answer = yield from self._request(mode_request(mode), Command.MODE, within_s=_MODE_S)
         if answer is None:
             raise ScannerTimeout("the scanner does not acknowledge the request to measure; check power and cable")
         if answer.data[:1] != b"\0":

@@ -18,6 +18,7 @@ from drivers.protocols.ls100 import (
     ERRORS,
     POINT_WORDS,
     PROFILE_ADDRESS,
+    READ,
     TIME_SPAN,
     TIME_TICK_S,
     TRANSIENT_ERRORS,
@@ -33,7 +34,8 @@ from drivers.protocols.scanner_events import ScannerEvent
 from drivers.scanline import DeviceInfo, Float64Array, Profile, SensorGeometry
 
 RATES = (115_200, 921_600, 9_600, 19_200, 38_400, 57_600, 230_400, 460_800, 2_000_000, 4_000_000)
-_TRIES = 3
+_REPLY_S = 0.1
+_TRIES = 4
 _REACH_MM = 32.766  # what sixteen bits of micrometres hold
 _BITS_PER_BYTE = 10
 _MAX_POINTS = 2_048
@@ -132,15 +134,15 @@ class Ls100Host(Conversation):
         ScannerRefused : when the sensor answers with an error that asking again does not mend.
         """
         command = int.from_bytes(request[2:4], "big")
-        within_s = 0.1 + 2 * (len(request) + 516) * _BITS_PER_BYTE / self.baud_rate
+        within_s = _REPLY_S + 2 * (len(request) + 516) * _BITS_PER_BYTE / self.baud_rate
         for _ in range(tries):
             self._say(request)
-            reply: Frame | None = yield Answer(lambda item: isinstance(item, Frame), within_s)
+            reply: Frame | None = yield Answer(lambda item: _may_answer(item, request), within_s)
             if reply is not None and reply.whole == request:
                 if not self._has_echo:
                     self._has_echo = True
                     self._advise("the adapter repeats what is sent to the sensor; its echo is passed over")
-                reply = yield Answer(lambda item: isinstance(item, Frame) and item.whole != request, within_s)
+                reply = yield Answer(lambda item: _may_answer(item, request) and item.whole != request, within_s)
             if reply is None:
                 continue
             if reply.command == command:
@@ -225,3 +227,10 @@ class Ls100Host(Conversation):
             self._in_trouble = (
                 f"no profile has come for {self.silent_after_s:.2g} s; check the sensor's power and its cable"
             )
+
+
+def _may_answer(item: Any, request: bytes) -> bool:
+    """False for a reply that came too late: one to a read of another address, which was asked for and given up."""
+    if not isinstance(item, Frame):
+        return False
+    return item.command != READ or request[2:4] != READ.to_bytes(2, "big") or item.data[:4] == request[4:8]

@@ -21,6 +21,7 @@ class ProfileAccount:
         self._dropped = 0
         self._timed_s = 0.0
         self._timed_pass = 0
+        self._is_torn = False  # since the last profile bytes were damaged, or the link was down
 
     @property
     def latest_line(self) -> int:
@@ -40,16 +41,24 @@ class ProfileAccount:
         """Profiles that the device made and that did not arrive; their reason is what happened on the wire."""
         self._next_line += min(max(n_lines, 0), _MAX_SKIP)
 
-    def lost_by_time(self, device_time_s: float, period_s: float) -> None:
-        """Enter the profiles that are missing before one of `device_time_s`, of a scanner that makes one a period."""
+    def lost_by_time(self, device_time_s: float, period_s: float) -> int:
+        """Enter the profiles that are missing before one of `device_time_s`, of a scanner that makes one a period.
+
+        Return how many of them the device did not send. Those are told from the ones that the wire lost: a wire that
+        loses anything leaves a torn end, so that a gap between two sound neighbours is the device's own.
+        """
+        n_lines = 0
         if self._timed_pass == self.pass_index:
-            self.lost(round((device_time_s - self._timed_s) / period_s) - 1)
+            n_lines = max(0, round((device_time_s - self._timed_s) / period_s) - 1)
+            self.lost(n_lines)
         self._timed_s, self._timed_pass = device_time_s, self.pass_index
+        return 0 if self._is_torn else n_lines
 
     def enter(self, dropped_lines: int = 0) -> bool:
         """Enter the next profile; `dropped_lines` of those lost so far the device dropped itself."""
         number, self._dropped = self._next_line % _U32, dropped_lines % _U32
         self._next_line += 1
+        self._is_torn = False
         return self._ledger.chunk(number, number, self._dropped, self._dropped, self.pass_index).kind is Kind.NEW
 
     def handed_on(self, no_return: dict[str, int], *, whole: bool) -> None:
@@ -63,10 +72,12 @@ class ProfileAccount:
 
     def damage(self, damage: Damage) -> None:
         """Enter a damaged piece of the stream."""
+        self._is_torn = True
         self._ledger.damage(damage.reason.value, damage.n_bytes)
 
     def link_lost(self) -> None:
         """Enter that the link is down: what is lost until the next profile is lost by that."""
+        self._is_torn = True
         self._ledger.link_lost()
 
     def tally(self) -> Tally:

@@ -16,8 +16,8 @@ from drivers.scanline import BoolArray
 IntArray = npt.NDArray[np.int64]
 
 BLOCK_CHARS = 64
-MAX_REPLY_BYTES = 16_384
-"""The longest reply is a scan of 1,440 steps with distance and intensity: 8,640 characters and 135 sums."""
+MAX_REPLY_BYTES = 32_768
+"""The longest reply is a scan of 1,440 steps with three echoes of distance and intensity: 28,800 characters."""
 CLOCK_SPAN = 1 << 24
 CLOCK_TICK_S = 1e-3
 SCANNING = "99"
@@ -26,7 +26,7 @@ STREAMS = {"MD": 3, "MS": 2, "ME": 6}
 """Characters of one step; ME is a distance and an intensity of three each."""
 SINGLES = {"GD": 3, "GS": 2, "GE": 6}
 _FIRST, _LAST = 0x30, 0x6F
-_STREAM_ECHO = re.compile(r"(M[DSE])(\d{4})(\d{4})(\d{2})(\d)(\d{2})")
+_STREAM_ECHO = re.compile(r"(M[DSE]|N[DE])(\d{4})(\d{4})(\d{2})(\d)(\d{2})")
 
 
 def check_character(data: bytes) -> int:
@@ -106,7 +106,7 @@ class Scan:
 
 
 def stream_echo(echo: str) -> StreamEcho | None:
-    """Return what an echo of MD, MS or ME says; None for any other."""
+    """Return what an echo of MD, MS, ME, ND or NE says; None for any other."""
     match = _STREAM_ECHO.fullmatch(echo.split(";", 1)[0])
     return StreamEcho(match[1], *map(int, match.groups()[1:])) if match else None
 

@@ -5,7 +5,7 @@ What it asks for is only what the sensor announced (PP), because old firmware lo
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,11 +25,13 @@ from drivers.protocols.scip import (
     STREAMS,
     Reply,
     ReplyDecoder,
+    Scan,
     info_fields,
     n_steps,
     scan_of,
     stream_echo,
 )
+from drivers.protocols.scip_echoes import ECHO_STREAMS, NONE, EchoScan, echoes_of
 from drivers.scanline import DeviceInfo, Profile, SensorGeometry
 
 RATES = (115_200, 19_200, 38_400, 57_600, 250_000, 500_000, 750_000)
@@ -40,6 +42,7 @@ _STALE_S = 2.5  # a scan that was under way at 19200 baud takes more than a seco
 _BITS_PER_BYTE = 10
 _MAX_INTERVAL = 9
 _CODES = 32  # no model has more codes; a nearest distance beyond them must not make more reasons
+_WIDTHS = STREAMS | ECHO_STREAMS
 _LINE_SHARE = 0.95  # of the line's time that scans may fill: replies and a slow motor need the rest
 
 
@@ -50,7 +53,9 @@ class ScipOptions:
     Parameters
     ----------
     field_of_view_rad : (lowest, highest) angle, 0 ahead, counter-clockwise; None is all the sensor has.
-    command : `MD` distances of three characters, `MS` of two (up to 4,095 mm), `ME` with intensities.
+    command : `MD` distances of three characters, `MS` of two (up to 4,095 mm), `ME` with intensities; of newer models
+        `ND` with several echoes a step, `NE` the same with intensities.
+    echo : which of several echoes counts: `first`, `last`, or the `strongest`, which needs `NE`.
     cluster : neighbouring steps merged into one value, the smallest distance of them.
     interval : scans left out between two, 0 to 9; None is as few as the line has time for, and says so.
     work_rate : baud rate to switch to where the sensor answers at a lower one; None stays.
@@ -61,10 +66,16 @@ class ScipOptions:
     cluster: int = 1
     interval: int | None = None
     work_rate: int | None = 115_200
+    echo: str = "first"
 
     def __post_init__(self) -> None:
-        if self.command not in STREAMS:
-            raise ValueError(f"a lidar is asked with one of {', '.join(STREAMS)}, not {self.command!r}")
+        if self.command not in _WIDTHS:
+            raise ValueError(f"a lidar is asked with one of {', '.join(_WIDTHS)}, not {self.command!r}")
+        needed = {"first": tuple(_WIDTHS), "last": ("ND", "NE"), "strongest": ("NE",)}.get(self.echo)
+        if needed is None:
+            raise ValueError(f"echo must be first, last or strongest, not {self.echo!r}")
+        if self.command not in needed:
+            raise ValueError(f"the {self.echo} echo is told with command {' or '.join(needed)}, not {self.command}")
         if not 1 <= self.cluster <= 99:
             raise ValueError(f"cluster must be 1 to 99, not {self.cluster}")
         if self.interval is not None and not 0 <= self.interval <= _MAX_INTERVAL:
@@ -119,8 +130,11 @@ class _Request:
 
 
 def scan_bytes(command: str, n_values: int) -> int:
-    """Return the bytes of one scan on the wire: echo, status, time, blocks of 64 with sum and end, empty line."""
-    n_chars = n_values * STREAMS[command]
+    """Return the bytes of one scan on the wire: echo, status, time, blocks of 64 with sum and end, empty line.
+
+    Of ND and NE with one echo a step; each further one is a character more than the first.
+    """
+    n_chars = n_values * _WIDTHS[command]
     return 16 + 4 + 6 + n_chars + 2 * -(-n_chars // BLOCK_CHARS) + 1
 
 
@@ -141,6 +155,7 @@ class ScipHost(Conversation):
         self._request: _Request | None = None
         self._angles_rad = np.empty(0)
         self._clock = DeviceClock(CLOCK_SPAN, CLOCK_TICK_S)
+        self._dropped_lines = 0  # scans that the lidar made and had no time to send
 
     # ---- scripts --------------------------------------------------------------------------------------------------
 
@@ -272,21 +287,18 @@ class ScipHost(Conversation):
         if item.status != SCANNING:
             self._take_status(item.status)
             return
-        width = STREAMS[request.command]
-        scan = scan_of(item, width, request.n_values)
+        scan = self._read(item, request)
         if scan is None:
             self._damage(Damage(DamageReason.BAD_SUM, item.n_bytes))
             return
         device_time_s = self._clock.read(scan.timestamp, now_s)
         self._jumped(self._clock.jumps)
-        self._account.lost_by_time(device_time_s, self._period_s(request, parameters))
-        if not self._account.enter():
+        self._dropped_lines += self._account.lost_by_time(device_time_s, self._period_s(request, parameters))
+        if not self._account.enter(self._dropped_lines):
             return
         if scan.damaged_bytes:
             self._damage(Damage(DamageReason.BAD_SUM, scan.damaged_bytes))
-        has_intensities = width == STREAMS["ME"]
-        codes = scan.values[::2] if has_intensities else scan.values
-        missing = scan.damaged[::2] if has_intensities else scan.damaged
+        codes, missing = scan.values, scan.damaged
         range_mm = codes.astype(np.float64)
         range_mm[missing] = np.nan
         low = np.unique(codes[codes < min(parameters.min_mm, _CODES)]).tolist()
@@ -295,6 +307,17 @@ class ScipHost(Conversation):
         counts = reasons_of(range_mm, reasons)
         x_mm, z_mm = sensor_from_polar(range_mm, self._angles_rad)
         self._profile(x_mm, z_mm, missing.copy(), device_time_s, now_s, counts)
+
+    def _read(self, answer: Reply, request: _Request) -> Scan | None:
+        """The scan in a reply, a distance a step."""
+        width = _WIDTHS[request.command]
+        if request.command in ECHO_STREAMS:
+            told = echoes_of(answer, width, request.n_values)
+            return None if told is None else _one_echo(told, self._options.echo)
+        scan = scan_of(answer, width, request.n_values)
+        if scan is None or width != STREAMS["ME"]:
+            return scan
+        return replace(scan, values=scan.values[::2], damaged=scan.damaged[::2])
 
     def _take_status(self, status: str) -> None:
         if status.isdigit() and 50 <= int(status) <= 97:
@@ -339,6 +362,17 @@ class ScipHost(Conversation):
         return parameters.period_s * (request.interval + 1)
 
 
+def _one_echo(told: EchoScan, which: str) -> Scan:
+    """The scan with one distance a step: the first, the last or the strongest of its echoes."""
+    column = np.zeros(len(told.distances), dtype=np.int64)
+    if which == "last":
+        column = np.maximum((told.distances != NONE).sum(axis=1) - 1, 0)
+    elif which == "strongest":
+        column = np.argmax(told.intensities, axis=1)
+    values = told.distances[np.arange(len(column)), column]
+    return Scan(told.timestamp, np.where(told.damaged, 0, values), told.damaged, told.damaged_bytes)
+
+
 def _is_reply_to(command: str) -> Callable[[Any], bool]:
     return lambda item: isinstance(item, Reply) and item.echo == command
 
@@ -360,6 +394,8 @@ def _parameters(fields: dict[str, str]) -> Parameters:
 def _meaning(status: str) -> str:
     """What a status of a measuring command says."""
     number = int(status) if status.isdigit() else -1
+    if status in ("0D", "0E"):
+        return f"it does not know this request (status {status}); ME, ND and NE are for newer models, use MD or MS"
     if 1 <= number <= 7:
         return f"a value of the request is wrong (status {status})"
     if number == 10:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from drivers.errors import StageError, StageNotConnected, StageStopped, StageTimeout
+from drivers.protocols.listening import listened_s
 from drivers.protocols.outbox import Outbox
 from drivers.protocols.stage_events import PositionLost, Reading, StageEvent, StageReconnected
 from drivers.protocols.text_lines import TextLines
@@ -17,7 +18,6 @@ from drivers.protocols.text_lines import TextLines
 NOT_HOMED = "the stage has not homed since it was connected"
 HOMING_S = 120.0
 SILENCE_S = 3.0
-_LISTENED_S = 0.25
 
 
 class Phase(Enum):
@@ -131,10 +131,14 @@ class StageHost(ABC):
 
     def tick(self, now_s: float) -> None:
         """Do what is due by now."""
-        # A program that was held up for a while has not listened: only time in which it did counts as silence.
-        self._quiet_s += min(max(0.0, now_s - self._ticked_s), _LISTENED_S)
-        self._ticked_s = now_s
+        # A program that was held up for a while has not listened: only time in which it did counts as silence, and an
+        # errand has as much more time.
+        counts_s = listened_s(self._ticked_s, now_s)
+        self._quiet_s += counts_s
         errand = self.errand
+        if errand is not None:
+            errand.give_up_s += max(0.0, now_s - self._ticked_s) - counts_s
+        self._ticked_s = now_s
         if errand is not None and not errand.is_over and now_s > errand.give_up_s:
             self._run_out(errand, now_s)
         if self.phase is not Phase.DOWN:

@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Self, TypeAlias
 
 from drivers.errors import DriverError, PortError, ScannerNotConnected, ScannerSilent, ScannerTimeout
+from drivers.patience import wait_patiently
 from drivers.port import LEAVE_LINES, ModemLines
 from drivers.protocols.conversation import Conversation, Phase, Task
 from drivers.protocols.scanner_events import ScannerEvent
@@ -83,7 +84,7 @@ class FreeRunner:
             self._path, host, self._changed, self._clock, lambda: Wire(host.baud_rate, host.dtr), self._lines
         )
         with self._changed:
-            self._changed.wait_for(lambda: host.info is not None or link.failure is not None, _ENTER_S)
+            wait_patiently(self._changed, lambda: host.info is not None or link.failure is not None, _ENTER_S)
             info, failure, silence = host.info, link.failure, host.failure
         if info is not None:
             return info
@@ -166,7 +167,7 @@ class FreeRunner:
         with self._changed:
             if host.phase is Phase.UP and link.failure is None:
                 task = host.stop(self._clock())
-                self._changed.wait_for(lambda: task.done or link.failure is not None, _EXIT_S)
+                wait_patiently(self._changed, lambda: task.done or link.failure is not None, _EXIT_S)
         link.close()
         with self._changed:
             host.end()
@@ -181,8 +182,8 @@ class FreeRunner:
         link = self._link
         with self._changed:
             task = ask()
-            in_time = self._changed.wait_for(
-                lambda: task.done or (link is not None and link.failure is not None), _COMMAND_S
+            in_time = wait_patiently(
+                self._changed, lambda: task.done or (link is not None and link.failure is not None), _COMMAND_S
             )
             if task.failure is not None:
                 raise type(task.failure)(f"{self._path}: {task.failure}")

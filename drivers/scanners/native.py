@@ -18,6 +18,7 @@ from drivers.errors import (
     ScannerSilent,
     ScannerTimeout,
 )
+from drivers.patience import wait_patiently
 from drivers.protocols.native_host import NativeHost, Phase
 from drivers.protocols.native_messages import PROTOCOL_VERSION
 from drivers.protocols.native_requests import PassPlan, Request, describe_failure
@@ -85,8 +86,10 @@ class NativeScanner:
         self._host = host = NativeHost(self._inbox.deliver, self._inbox.tell)
         self._link = link = Link(self._path, host, self._changed, self._clock, lambda: Wire(self._baud_rate))
         with self._changed:
-            self._changed.wait_for(
-                lambda: host.stream is not None or host.other_version is not None or link.failure is not None, _ENTER_S
+            wait_patiently(
+                self._changed,
+                lambda: host.stream is not None or host.other_version is not None or link.failure is not None,
+                _ENTER_S,
             )
             stream, version, failure = host.stream, host.other_version, link.failure
         if stream is not None:
@@ -145,8 +148,10 @@ class NativeScanner:
                 host.abandon(self._clock())
         self._command(lambda: host.stop(self._clock()))
         with self._changed:
-            self._changed.wait_for(
-                lambda: host.plan is None or host.phase is not Phase.UP or self._failure is not None, _END_S
+            wait_patiently(
+                self._changed,
+                lambda: host.plan is None or host.phase is not Phase.UP or self._failure is not None,
+                _END_S,
             )
             if host.plan is not None:
                 host.abandon(self._clock())
@@ -210,8 +215,10 @@ class NativeScanner:
                 host.abandon(now_s)
                 return
             stop, off = host.stop(now_s), host.arm(False, now_s)
-            self._changed.wait_for(
-                lambda: (stop.done and off.done) or host.phase is not Phase.UP or self._failure is not None, _EXIT_S
+            wait_patiently(
+                self._changed,
+                lambda: (stop.done and off.done) or host.phase is not Phase.UP or self._failure is not None,
+                _EXIT_S,
             )
             host.abandon(self._clock())
 

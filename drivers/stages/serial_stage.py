@@ -21,6 +21,7 @@ from drivers.errors import (
     StageSilent,
     StageTimeout,
 )
+from drivers.patience import wait_patiently
 from drivers.port import ModemLines
 from drivers.protocols.stage_events import Reading, StageDisconnected, StageEvent, StageReconnected
 from drivers.protocols.stage_host import Errand, Phase, StageHost
@@ -33,6 +34,7 @@ HostMaker: TypeAlias = Callable[[Callable[[Reading], None], Callable[[StageEvent
 
 _AS_IT_IS = ModemLines()
 _EXIT_S = 3.0
+_READING_S = 5.0
 _MAX_EVENTS = 1_000
 _SLACK_MM = 1e-6
 
@@ -106,7 +108,8 @@ class SerialStage:
             self._port_name, self._baud_rate, self._lines, self._host, self._changed, self._clock, self._lost
         )
         with self._changed:
-            self._changed.wait_for(
+            wait_patiently(
+                self._changed,
                 lambda: (
                     (self._host.phase is Phase.UP and self._where.latest is not None)
                     or self._host.refusal is not None
@@ -129,7 +132,7 @@ class SerialStage:
         with self._changed:
             if self._host.phase is Phase.UP and self._host.is_busy and self._failure is None:
                 errand = self._host.stop(self._clock())
-                self._changed.wait_for(lambda: errand.is_over or self._failure is not None, _EXIT_S)
+                wait_patiently(self._changed, lambda: errand.is_over or self._failure is not None, _EXIT_S)
         link.close()
         with self._changed:  # whoever still waits, in another thread, waits for nobody
             self._link = None
@@ -287,12 +290,13 @@ class SerialStage:
         """Wait for a reading that was asked for from now on."""
         now_s = self._clock()
         with self._changed:
-            self._changed.wait_for(
+            wait_patiently(
+                self._changed,
                 lambda: (
                     (self._where.latest is not None and self._where.latest.asked_s >= now_s)
                     or self._failure is not None
                 ),
-                5.0,
+                _READING_S,
             )
             latest = self._where.latest
             if latest is None or latest.asked_s < now_s:

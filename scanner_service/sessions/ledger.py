@@ -3,7 +3,8 @@
 import threading
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from copy import deepcopy
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from drivers.tally import PassTally
@@ -106,6 +107,16 @@ class Ledger:
         with self._lock:
             self.counted -= points
             self.left_out["withdrawn"] += points
+
+    def snapshot(self) -> "Ledger":
+        """A copy as of now.
+
+        Where there is a wire, its accounts are to be read after this: a line is counted there before it gets here, so
+        that none which the copy knows can be missing in them.
+        """
+        with self._lock:
+            held = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "_lock"}
+            return Ledger(**deepcopy(held))
 
     def passes(self, wire: Mapping[PassKey, PassTally] | None = None) -> dict[PassKey, PassAccount]:
         """The account of every pass; `wire` is the driver's own of those that came over one."""

@@ -69,7 +69,7 @@ class LiveSession:
         self._held = False
         self._closing = threading.Event()
         self._is_closing = False
-        self._earlier_wire: Mapping[PassKey, PassTally] = {}
+        self._wires: tuple[Mapping[PassKey, PassTally], Source] = ({}, source)  # accounts of what was, and what is
         self._analyst = threading.Thread(target=self._analyse, name=f"analyst-{row.session_id}", daemon=True)
 
     @property
@@ -145,7 +145,10 @@ class LiveSession:
                 or not np.allclose(source.towards_sensor, known.towards_sensor)
             ):
                 source.towards_sensor = None  # the passes look from several sides: each is judged by its own rays
+            before = self._wires
+            told = known.pass_tallies() if isinstance(known, OnAWire) else {}
             self.source, self._state = source, "scanning"
+            self._wires = (_joined(before[0], told), source)
             self._time.start()
             try:  # what the pass is judged by is in the record before any line of it
                 self.event(CALIBRATED, calibration_of(source))
@@ -154,10 +157,9 @@ class LiveSession:
                 self.event(CALIBRATED, calibration_of(known))
                 self._time.stop()
                 self.source, self._state = known, "stopped"
+                self._wires = before
                 source.stop()
                 raise
-            if isinstance(known, OnAWire):
-                self._earlier_wire = _joined(self._earlier_wire, known.pass_tallies())
             self._set_state(self._state)
 
     def push(self, line: Scanline) -> "Future[Stored]":
@@ -351,9 +353,10 @@ class LiveSession:
 
     def losses(self) -> dict[str, Any]:
         """The whole ledger: lines, points, each pass, and what the driver of the latest source counted on the wire."""
-        source = self.source
-        wire = _joined(self._earlier_wire, source.pass_tallies() if isinstance(source, OnAWire) else {})
-        return self.engine.ledger.to_dict(source.tally(), wire)
+        ledger = self.engine.ledger.snapshot()  # before the wire's accounts: see there
+        earlier, source = self._wires
+        wire = _joined(earlier, source.pass_tallies() if isinstance(source, OnAWire) else {})
+        return ledger.to_dict(source.tally(), wire)
 
     def status(self) -> Status:
         """What the session is doing now."""

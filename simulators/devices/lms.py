@@ -37,6 +37,9 @@ _BOOT_S = 1.0
 _BYTE_GAP_S = 0.006
 _CONFIGURATION = bytes.fromhex("0000 7000 02 04 01 00 00 02 02") + bytes(23)
 _RATES = {int(mode): rate for rate, mode in RATE_MODES.items()}
+_STREAMS = (Mode.STREAM, Mode.STREAM_PARTIAL)
+_TURNS = {100: 1, 50: 2, 25: 4}
+"""Turns of the mirror that make a whole scan, by resolution in 1/100 degree."""
 
 
 class LmsDevice:
@@ -110,10 +113,17 @@ class LmsDevice:
             self._out += bytes([NAK])
 
     def transmit(self, now_s: float, room_bytes: int) -> bytes:
-        """At most `room_bytes` of what there is to send by now."""
+        """At most `room_bytes` of what there is to send by now.
+
+        What the line had time for since the last call was sent meanwhile: a scan finds the line as that leaves it.
+        """
         while self._later and self._later[0][0] <= now_s:
             self._out += self._later.popleft()[1]
+        sent = self._send(room_bytes)
         self._measure(now_s)
+        return sent + self._send(room_bytes - len(sent))
+
+    def _send(self, room_bytes: int) -> bytes:
         sent = bytes(self._out[:room_bytes])
         del self._out[:room_bytes]
         if not self._out and self._rate_after is not None:
@@ -125,7 +135,7 @@ class LmsDevice:
         if self._out:
             return now_s
         due = [self._later[0][0]] if self._later else []
-        if self._mode == Mode.STREAM:
+        if self._mode in _STREAMS:
             due.append(max(now_s, self._next_s))
         return min(due, default=None)
 
@@ -179,13 +189,13 @@ class LmsDevice:
             self._reply(Command.MODE + REPLY_BIT, b"\0")
             self._rate_after = _RATES[mode]
             return
-        if mode not in (Mode.STREAM, Mode.ON_REQUEST):
+        if mode not in (*_STREAMS, Mode.ON_REQUEST):
             self._reply(Command.MODE + REPLY_BIT, b"\2")
             return
-        if mode == Mode.STREAM and self._mode != Mode.STREAM:
+        is_new, self._mode = mode != self._mode, mode
+        if mode in _STREAMS and is_new:
             self._next_s = now_s + self._scan_s
             self._since_s = self._next_s
-        self._mode = mode
         self._may_configure = False
         self._reply(Command.MODE + REPLY_BIT, b"\0")
 
@@ -204,10 +214,10 @@ class LmsDevice:
 
     @property
     def _scan_s(self) -> float:
-        return _TURN_S * {100: 1, 50: 2, 25: 4}[self._variant[1]]
+        return _TURN_S * (1 if self._mode == Mode.STREAM_PARTIAL else _TURNS[self._variant[1]])
 
     def _measure(self, now_s: float) -> None:
-        while self._mode == Mode.STREAM and self._next_s <= now_s:
+        while self._mode in _STREAMS and self._next_s <= now_s:
             at_s = self._next_s
             self._next_s += self._scan_s
             self.scans_made += 1
@@ -219,6 +229,10 @@ class LmsDevice:
     def _scan(self, at_s: float) -> bytes:
         angle, resolution = self._variant
         degrees = first_angle_deg(angle) + resolution / 100 * np.arange(angle * 100 // resolution + 1) - 90.0
+        partial_deg = None
+        if self._mode == Mode.STREAM_PARTIAL:
+            turn = self._scan_index % _TURNS[resolution]
+            degrees, partial_deg = degrees[turn :: _TURNS[resolution]], turn * resolution / 100
         unit = self._configuration[6]
         nothing = (1 << DISTANCE_BITS[self._configuration[5]]) - 1
         counts = np.rint(self._scene(np.radians(degrees), at_s - self._since_s) / UNITS_MM[unit])
@@ -228,7 +242,7 @@ class LmsDevice:
         values = Values(
             raw,
             UNITS_MM[unit],
-            None,
+            partial_deg,
             self._scan_index if indexed else None,
             self._telegram_index if indexed else None,
         )

@@ -15,18 +15,20 @@ from drivers.protocols.scip import (
     SCANNING,
     SINGLES,
     STREAMS,
+    IntArray,
     checked,
     data_lines,
     encode_value,
     info_lines,
-    n_steps,
     reply,
 )
+from drivers.protocols.scip_echoes import ECHO_SINGLES, ECHO_STREAMS, echo_characters
+from drivers.scanline import Float64Array
 from simulators.sweep import RangeScene
 
 _RATES = (19_200, 38_400, 57_600, 115_200, 250_000, 500_000, 750_000)
 _MAX_REQUEST = 64
-_MEASURE = re.compile(r"(M[DSE]|G[DSE])(\d{4})(\d{4})(\d{2})(?:(\d)(\d{2}))?")
+_MEASURE = re.compile(r"(M[DSE]|N[DE]|G[DSE]|H[DE])(\d{4})(\d{4})(\d{2})(?:(\d)(\d{2}))?")
 _TAG = re.compile(r"[A-Za-z0-9 ._+@]{0,16}")
 
 
@@ -42,10 +44,14 @@ class Model:
     last: int
     front: int
     rpm: int
+    tells_echoes: bool = False
 
 
 URG_04LX = Model("URG-04LX(Hokuyo Automatic Co.,Ltd.)", 20, 5600, 1024, 44, 725, 384, 600)
 UTM_30LX = Model("UTM-30LX[Serial No]", 23, 60_000, 1440, 0, 1080, 540, 2400)
+UTM_30LX_EW = Model("UTM-30LX-EW", 23, 60_000, 1440, 0, 1080, 540, 2400, tells_echoes=True)
+_FIRST_LIGHT, _FURTHER_LIGHT = 1000, 2500
+"""Intensities: what the beam goes through gives back less than what it ends on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +87,7 @@ class ScipDevice:
     serial : its serial number.
     baud_rate : the rate it wakes up at; the port follows `baud_rate` when SS changes it.
     clock_ms : what its 24-bit clock shows when it is switched on.
+    behind : what it sees through the scene, as further echoes, where its model tells them.
     """
 
     def __init__(
@@ -92,6 +99,7 @@ class ScipDevice:
         baud_rate: int = 19_200,
         clock_ms: int = 0,
         quirks: Quirks | None = None,
+        behind: RangeScene | None = None,
     ) -> None:
         self.baud_rate = baud_rate
         self.model = model
@@ -100,6 +108,7 @@ class ScipDevice:
         """Scans that were due in a measurement; those not sent for want of time on the line are among them."""
         self.scans_sent = 0
         self._scene = scene
+        self._behind = behind
         self._serial = serial
         self._power_on_rate = baud_rate
         self._clock_ms = clock_ms
@@ -132,9 +141,16 @@ class ScipDevice:
                 self._obey(request, now_s)
 
     def transmit(self, now_s: float, room_bytes: int) -> bytes:
-        """At most `room_bytes` of what there is to send by now."""
+        """At most `room_bytes` of what there is to send by now.
+
+        What the line had time for since the last call was sent meanwhile: a scan finds the line as that leaves it.
+        """
         self._start_clock(now_s)
+        sent = self._send(room_bytes)
         self._measure(now_s)
+        return sent + self._send(room_bytes - len(sent))
+
+    def _send(self, room_bytes: int) -> bytes:
         while len(self._out) < room_bytes and self._rate_after is None and self._replies:
             answer, rate = self._replies.popleft()
             self._out += answer
@@ -217,6 +233,8 @@ class ScipDevice:
                 self._answer(request, "00" if number in ("01", "02", "03", "04", "05", "10") else "01")
             case "MD" | "MS" | "ME" | "GD" | "GS" | "GE", _:
                 self._start(request, command, now_s)
+            case "ND" | "NE" | "HD" | "HE", _ if self.model.tells_echoes:
+                self._start(request, command, now_s)
             case _:
                 self._answer(request, "0E")
 
@@ -282,7 +300,7 @@ class ScipDevice:
 
     def _start(self, request: str, command: str, now_s: float) -> None:
         match = _MEASURE.fullmatch(command)
-        is_stream = command[:2] in STREAMS
+        is_stream = command[:2] in STREAMS | ECHO_STREAMS
         if match is None or (match[5] is None) == is_stream:
             self._answer(request, "0C" if len(command) < 12 else "01")
             return
@@ -353,13 +371,21 @@ class ScipDevice:
             self._measuring_since_s = at_s
         steps = np.arange(start, end + 1)
         angles = ((steps - model.front) * (2 * np.pi / model.steps_per_turn)).astype(np.float64)
-        ranges = np.rint(self._scene(angles, at_s - self._measuring_since_s))
-        valid = (ranges >= model.min_mm) & (ranges <= model.max_mm)
-        far = np.where(valid, ranges, np.inf)
-        padded = np.full(n_steps(start, end, cluster) * cluster, np.inf)
-        padded[: len(far)] = far
-        nearest = padded.reshape(-1, cluster).min(axis=1)
-        values = np.where(np.isfinite(nearest), nearest, 0).astype(int)
+        elapsed_s = at_s - self._measuring_since_s
+        values = self._nearest(self._scene(angles, elapsed_s), cluster)
+        echo_width = (ECHO_STREAMS | ECHO_SINGLES).get(command)
+        if echo_width is not None:
+            further = np.zeros_like(values)
+            if self._behind is not None:
+                further = self._nearest(self._behind(angles, elapsed_s), cluster)
+            lights = (_FIRST_LIGHT, _FURTHER_LIGHT)
+            echoes = [
+                [(mm, light)[: echo_width // 3] for mm, light in zip(step, lights, strict=True) if mm] or [(0, 0)]
+                for step in np.stack([values, further], axis=1).tolist()
+            ]
+            return data_lines(
+                self._clock(at_s), echo_characters([[echo[: echo_width // 3] for echo in step] for step in echoes])
+            )
         width = (STREAMS | SINGLES)[command]
         if width == 2:
             values = np.where(values < 1 << 12, values, 0)
@@ -368,6 +394,15 @@ class ScipDevice:
         else:
             characters = b"".join(encode_value(int(value), width) for value in values)
         return data_lines(self._clock(at_s), characters)
+
+    def _nearest(self, ranges_mm: Float64Array, cluster: int) -> IntArray:
+        """The smallest distance of each cluster in whole mm, 0 where there is none."""
+        rounded = np.rint(ranges_mm)
+        valid = (rounded >= self.model.min_mm) & (rounded <= self.model.max_mm)
+        padded = np.full(-(-len(rounded) // cluster) * cluster, np.inf)
+        padded[: len(rounded)] = np.where(valid, rounded, np.inf)
+        nearest = padded.reshape(-1, cluster).min(axis=1)
+        return np.where(np.isfinite(nearest), nearest, 0).astype(np.int64)
 
     def _switch_laser(self, on: bool) -> None:
         if on and not self.laser_on:

@@ -66,8 +66,8 @@ class LockedAxes(Axes):
         return call
 
 
-class Bench:
-    """A lidar and a stage, each on its pty, and the rig that drives them."""
+class Devices:
+    """A lidar and a stage, each on its pty; `rig_text` is the rig file that puts them together."""
 
     def __init__(
         self,
@@ -101,9 +101,7 @@ class Bench:
             by=by,
             mounting=mounting,
         )
-        self.description = parse_rig(text)
-        self.rig = stack.enter_context(RunningRig(self.description))
-        self.rig.stage.home()
+        self.rig_text = text
 
     def scene(self, angles, elapsed_s):
         return self.see(angles, self.position_mm(self.lidar._measuring_since_s + elapsed_s))
@@ -111,6 +109,16 @@ class Bench:
     def position_mm(self, at_s):
         place = self.device.axes.position(at_s)[0]
         return place * MICROSTEP_MM if self.kind == "zaber" else place
+
+
+class Bench(Devices):
+    """The devices, and the rig that drives them."""
+
+    def __init__(self, stack, **options):
+        super().__init__(stack, **options)
+        self.description = parse_rig(self.rig_text)
+        self.rig = stack.enter_context(RunningRig(self.description))
+        self.rig.stage.home()
 
     def scan(self, order):
         self.rig.start(order)

@@ -197,3 +197,35 @@ def test_nobody_answers_is_told_and_so_is_a_stop_that_gets_no_answer() -> None:
 def test_options_that_cannot_be_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=r"cannot measure|has the rates|must be"):
         LmsOptions(**options)
+
+
+@pytest.mark.parametrize(("variant", "turns"), [((180, 100), 1), ((180, 50), 2), ((100, 25), 4)])
+def test_partial_scans_are_profiles_of_one_turn_that_together_see_what_a_whole_scan_sees(
+    variant: tuple[int, int], turns: int
+) -> None:
+    scanner = bench(work_rate=500_000, variant=variant, partial_scans=True).meet()
+    assert scanner.host.info.points_per_line == variant[0] + 1
+    scanner.start()
+    scanner.scan(5 * turns)
+    scanner.stop()
+    assert scanner.told == [PassEnded(1, "stopped")]
+    tally = scanner.host.tally()
+    assert tally.lines.sent == tally.lines.whole == len(scanner.lines)
+    np.testing.assert_allclose(np.diff([line.device_time_s for line in scanner.lines]), 0.01332, rtol=1e-6)
+    angles = []
+    for line in scanner.lines[:turns]:
+        seen = ~np.isnan(line.z_mm)
+        np.testing.assert_allclose(line.z_mm[seen], -200 - 0.1, atol=0.8)
+        angles.append(np.degrees(np.arctan2(line.x_mm[seen], -line.z_mm[seen])))
+        np.testing.assert_allclose(np.diff(angles[-1]), 1.0, atol=1e-6)
+    together = np.sort(np.concatenate(angles))
+    np.testing.assert_allclose(np.diff(together), variant[1] / 100, atol=1e-6)
+
+
+def test_partial_scans_that_the_line_has_no_time_for_are_the_scanners_own_loss() -> None:
+    scanner = bench(work_rate=38_400, variant=(180, 50), partial_scans=True).meet()
+    scanner.start()
+    scanner.scan(20)
+    lines = scanner.host.tally().lines
+    assert set(lines.lost) == {"device_dropped"}
+    assert lines.sent == lines.stored + lines.lost["device_dropped"]

@@ -145,3 +145,34 @@ def test_nobody_an_echo_and_a_sensor_that_refuses_are_told_apart() -> None:
 def test_options_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match="step must be 1 to 15"):
         Ls100Options(step=16)
+
+
+@pytest.mark.parametrize("late_s", [0.15, 0.25, 0.35])
+@pytest.mark.parametrize("has_echo", [False, True])
+def test_a_reply_that_comes_after_it_was_asked_again_is_taken_for_no_other(late_s: float, has_echo: bool) -> None:
+    device = Ls100Device(scene, baud_rate=921_600)
+    sensor = bench(EchoingAdapter(device) if has_echo else device).meet()
+    sensor.start()
+    sensor.scan(2)
+    held, until_s = bytearray(), sensor.now_s
+
+    def arrives(data: bytes) -> bytes:
+        held.extend(data)
+        if sensor.now_s < until_s:
+            return b""
+        arrived = bytes(held)
+        held.clear()
+        return arrived
+
+    sensor.corrupt = arrives
+    for _ in range(4):
+        sensor.run(0.03)
+        until_s = sensor.now_s + late_s
+        sensor.scan(2)
+    sensor.stop()
+    tally = sensor.host.tally()
+    assert tally.lines.lost == {}
+    assert tally.lines.whole == len(sensor.lines) == tally.lines.sent
+    for line in sensor.lines:
+        assert len(line.x_mm) == N_POINTS
+        assert (np.diff(line.x_mm[np.isfinite(line.x_mm)]) > 0).all()

@@ -1,0 +1,91 @@
+"""What a session tells of its losses balances in every answer, however wire, session and record run on meanwhile."""
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.scanline import DeviceInfo, SensorGeometry
+from drivers.tally import BootLedger
+from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.settings import SessionSettings
+from scanner_service.sessions.source_specs import PushSpec
+from scanner_service.storage.record import Record
+from tests.unit.analysis.scans import scanline
+
+GEOMETRY = SensorGeometry(np.array([0.0, 0.0, 150.0]), np.array([0.0, 60.0, 150.0]), (-20.0, 20.0), 0.1)
+ROW_MM = np.column_stack([np.arange(20) * 0.2, np.zeros(20), np.zeros(20)])
+
+
+class RestlessWire:
+    """A scanner whose lines come exactly while its accounts are being read: before, between and after them."""
+
+    def __init__(self, meanwhile):
+        self.geometry, self.towards_sensor = GEOMETRY, np.array([0.0, 0.0, 1.0])
+        self.info = DeviceInfo("A", "M", "F", "C", 1, 20, GEOMETRY)
+        self._meanwhile = meanwhile
+        self._account = BootLedger(boot_id=1)
+        self._next = self._delivered = 0
+
+    def start(self, sink):
+        self._sink = sink
+
+    def stop(self):
+        pass
+
+    def progress(self):
+        return None
+
+    def tally(self):
+        self._measure()
+        told = self._account.tally().to_dict()
+        self._measure()
+        return told
+
+    def pass_tallies(self):
+        self._measure()
+        passes = self._account.tally().passes
+        self._measure()
+        return {("A", boot, index): told for (boot, index), told in passes.items()}
+
+    def _measure(self):
+        for is_lost in self._meanwhile.pop() if self._meanwhile else ():
+            number, self._next = self._next, self._next + 1
+            if not is_lost:
+                self._account.chunk(number, number, 0, 0)
+                self._account.line_closed(whole=True)
+                self._sink.line(scanline(ROW_MM + np.array([0.0, 0.2 * number, 0.0]), number))
+                self._delivered += 1
+        while self._sink.engine.ledger.snapshot().received < self._delivered:  # until the session has heard of all
+            time.sleep(0.001)
+
+
+@pytest.fixture(scope="module")
+def book(tmp_path_factory):
+    with Record.open(tmp_path_factory.mktemp("losses") / "record.sqlite") as record:
+        book = SessionBook(record)
+        yield book
+        book.close()
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.lists(st.booleans(), max_size=4), max_size=20))
+def test_every_answer_balances_and_nothing_is_less_than_under_way(book, meanwhile):
+    source = RestlessWire([list(lines) for lines in meanwhile])
+    session = book.create("test", PushSpec(), SessionSettings(max_points=20_000), source=source)
+    session.start()
+    for _ in range(8):
+        told = session.losses()
+        lines = told["lines"]
+        assert lines["received"] == lines["pending"] + lines["stored"] + lines["duplicates"] + lines["conflicts"]
+        assert told["device"]["lines"]["stored"] >= lines["received"]
+        for account in told["passes"]:
+            of_pass = account["lines"]
+            assert of_pass["under_way"] >= 0
+            assert of_pass["sent"] == of_pass["stored"] + of_pass["under_way"] + sum(of_pass["lost"].values())
+        assert sum(account["lines"]["stored"] for account in told["passes"]) == lines["stored"]
+    session.stop()
+    (account,) = session.losses()["passes"] or [None]
+    assert account is None or account["lines"]["under_way"] >= 0
