@@ -39,7 +39,9 @@ def compile_apart(method: str | None, points: int) -> None:
         return
     with errors.status("compiling kernels (only the first time) …"):
         subprocess.run(
-            [sys.executable, "-m", "scanner_service.commands.compiling_apart", name], check=False, capture_output=True
+            [sys.executable, "-P", "-m", "scanner_service.commands.compiling_apart", name],
+            check=False,
+            capture_output=True,
         )
 
 

@@ -27,7 +27,7 @@ def test_only_a_large_cloud_with_a_known_method_starts_a_process(started):
     compile_apart("no such method", LARGE)
     assert not started
     compile_apart("gaussian", LARGE)
-    assert started == [[sys.executable, "-m", "scanner_service.commands.compiling_apart", "gaussian"]]
+    assert started == [[sys.executable, "-P", "-m", "scanner_service.commands.compiling_apart", "gaussian"]]
 
 
 def test_what_was_compiled_is_not_compiled_again(started, tmp_path):
