@@ -14,6 +14,7 @@ from scanner_service.analysis.normals.field import NormalOptions
 from scanner_service.analysis.snapshot import Unreliable
 from scanner_service.commands.analyse_by_method import analyse_file_by_method, refuse
 from scanner_service.commands.clouds import open_points
+from scanner_service.commands.compiling_apart import compile_apart
 from scanner_service.commands.options import parse_position, parse_units
 from scanner_service.commands.orienting import orient_snapshot
 from scanner_service.commands.terminal import check_folder, console, errors, plain_errors, show_json
@@ -76,6 +77,7 @@ def analyse_command(
         check_folder(out)
         cloud = open_cloud(file, ReadOptions(parse_units(units)))
         position = parse_position(seen_from)
+        compile_apart(None, len(cloud.points_mm))
         with errors.status("computing density and normals …"):
             found = analyse_cloud(
                 cloud.points_mm,

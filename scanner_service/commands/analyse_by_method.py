@@ -13,6 +13,7 @@ from scanner_service.analysis.errors import AnalysisError
 from scanner_service.analysis.method_analysis import MethodAnswer, analyse_by_method, summarise_answer
 from scanner_service.analysis.normals.field import NormalOptions
 from scanner_service.commands.clouds import OpenedCloud
+from scanner_service.commands.compiling_apart import compile_apart
 from scanner_service.commands.terminal import check_folder, console, errors, show_json
 from scanner_service.storage.exports.method_ply import write_method_ply
 from scanner_service.storage.exports.results_json import write_json
@@ -37,6 +38,7 @@ def analyse_file_by_method(
         raise ValueError("the place that normals are turned to needs three numbers: say --seen-from x,y,z")
     check_folder(out)
     towards = cloud.laser_mm if seen_from_mm is None else np.array(seen_from_mm)
+    compile_apart(method, len(cloud.points_mm))
     with errors.status(f"{method} on {len(cloud.points_mm):,} points …"):
         answer = analyse_by_method(cloud.points_mm, method, options, towards_mm=towards, orient=orient)
     notes = (*cloud.notes, *answer.notes)

@@ -16,7 +16,7 @@ from scanner_service import __version__
 from scanner_service.analysis.comparison.noise import LEVELS, NoiseLevel
 from scanner_service.analysis.comparison.peers import peers
 from scanner_service.analysis.comparison.running import Meter, Row, compare, our_methods
-from scanner_service.analysis.comparison.shapes import SHAPES, KnownCloud, known_cloud
+from scanner_service.analysis.comparison.shapes import CUSTOMARY, SHAPES, KnownCloud, known_cloud
 from scanner_service.analysis.normals.estimating import METHODS
 from scanner_service.commands.clouds import open_points
 from scanner_service.commands.measuring import measured
@@ -33,7 +33,7 @@ def compare_command(
         list[Path] | None, typer.Argument(help="Clouds with reference normals; sphere, cylinder and edge without any.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the table and the picture.")] = Path("out"),
-    shape: Annotated[list[str] | None, typer.Option(help="sphere, cylinder or edge; repeat it for more.")] = None,
+    shape: Annotated[list[str] | None, typer.Option(help=f"{', '.join(SHAPES)}; repeat it for more.")] = None,
     method: Annotated[list[str] | None, typer.Option(help="Only this method; repeat it for more.")] = None,
     points: Annotated[int, typer.Option(min=50, max=1_000_000, help="Points of each shape.")] = 10_000,
     noise: Annotated[
@@ -108,8 +108,8 @@ def row_answer(row: Row) -> dict[str, Any]:
 def _clouds(
     files: Sequence[Path], shapes: list[str] | None, points: int, units: str | None, rng: np.random.Generator
 ) -> list[KnownCloud]:
-    """The clouds asked for: files, shapes or both; all shapes when nothing is."""
-    clouds = [SHAPES[name](points, rng) for name in (shapes or ([] if files else SHAPES))]
+    """The clouds asked for: files, shapes or both; the customary shapes when nothing is."""
+    clouds = [SHAPES[name](points, rng) for name in (shapes or ([] if files else CUSTOMARY))]
     for file in files:
         opened = open_points(file, units, None)
         if opened.normals is None:

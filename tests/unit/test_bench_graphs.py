@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from benchmarks import neighbours, orientation
+from benchmarks import graphs, neighbours, orientation
 
 
 def test_every_structure_covers_the_same_neighbours_and_the_cost_of_lists_grows_with_them(tmp_path, capsys):
@@ -46,3 +46,12 @@ def test_a_run_orients_all_points_outwards(tmp_path):
     assert row["right_share"] == 1.0
     assert row["without_normal"] < 0.02 * 5000
     assert row["wall_s"] >= row["normals_s"] > 0
+
+
+def test_a_graph_is_measured_in_a_process_of_its_own_and_its_edges_are_counted(tmp_path, capsys):
+    file = tmp_path / "graphs.json"
+    assert graphs.main(["--points", "700", "--graph", "euclidean_spanning_tree", "--json", str(file)]) == 0
+    row = json.loads(file.read_text())["graphs"]["euclidean_spanning_tree"]
+    assert row["edges"] == 699
+    assert 0 < row["before_bytes"] <= row["peak_bytes"]
+    assert "699 edges" in capsys.readouterr().out

@@ -17,7 +17,7 @@ LADDER = (10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 130, 160, 200, 250, 320, 
 
 MAX_ALIKE = 500
 SAMPLE = 1000
-DEALS = 4
+DEALS = 8
 DEALT = 20_000
 """A small cloud is dealt several times, or chance would choose: as often as makes up so many points, at most DEALS."""
 
