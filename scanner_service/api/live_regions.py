@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from scanner_service.rescan.region import RescanRegion
 
 
@@ -22,16 +24,21 @@ class RegionsTold:
 
 def _look(region: RescanRegion) -> tuple[object, ...]:
     """Everything that is told of a region but its place in the list; equal when there is nothing new to tell."""
-    return (
-        region.status,
-        region.reason,
+    numbers = (
         region.area_mm2,
         region.priority,
         region.confidence,
-        region.point_count,
         region.measured_per_mm2,
         region.required_per_mm2,
-        len(region.history),
-        region.centroid_mm.tobytes(),
+        region.counting_error_per_mm2,
+        region.line_spacing_mm,
+    )
+    return (
+        region.status,
+        region.reason,
+        region.remedy,
+        region.point_count,
+        region.history,
+        np.array([*numbers, *region.centroid_mm, *region.normal]).tobytes(),  # as bytes an unknown number equals itself
         *(loop.tobytes() for loop in region.outline_mm),
     )

@@ -55,6 +55,7 @@ class Judgement:
         self._read_s = math.nan  # when the map was read that the results are of
         self._regions = RegionBook()
         self._results: Results | None = None
+        self._judging = threading.Lock()
         self._in_force = threading.Lock()  # of the regions and the results
         self._mirror = Mirror()
         self._mirroring = threading.Lock()
@@ -79,8 +80,13 @@ class Judgement:
     def renew(self, source: Source, unless: int | None = None) -> Results | None:
         """Judge the map as it is, seen from that source; None when the engine is gone.
 
-        The verdict in force is the answer while the map is still of version `unless`.
+        The verdict in force is the answer while the map is still of version `unless`. Verdicts are reached one after
+        the other, so that map and regions of each are of one version.
         """
+        with self._judging:
+            return self._judge(source, unless)
+
+    def _judge(self, source: Source, unless: int | None) -> Results | None:
         try:
             if unless is not None and self._map_version() == unless:
                 return self._results
@@ -107,9 +113,8 @@ class Judgement:
         except SessionError:
             return None
         with self._in_force:
-            if self._results is None or snapshot.version >= self._results.snapshot.version:
-                results = self._results = self._followed(results)  # somebody may have marked a region meanwhile
-                self._read_s = read_s
+            results = self._results = self._followed(results)  # somebody may have marked a region meanwhile
+            self._read_s = read_s
         return results
 
     def mark_region(self, region_id: int, status: RegionStatus, why: str) -> None:

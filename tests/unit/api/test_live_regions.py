@@ -1,14 +1,16 @@
 """A client that keeps what it is told of regions knows them all, as they are."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from scanner_service.api.live_regions import RegionsTold
 from scanner_service.rescan.judgement import Reason
-from scanner_service.rescan.region import RescanRegion
+from scanner_service.rescan.region import RegionMoment, RegionStatus, RescanRegion
 
 
 def region(region_id: int, area_mm2: float = 1.0, side_mm: float = 1.0) -> RescanRegion:
@@ -46,3 +48,22 @@ def test_what_has_not_changed_is_not_told_again_even_in_another_place() -> None:
     assert news == {"order": [2, 1], "regions": []}
     news = told.news([region(1, side_mm=2.0)])
     assert (news["order"], [one["id"] for one in news["regions"]]) == ([1], [1])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"normal": np.array([0.0, 0.0, 1.0])},
+        {"line_spacing_mm": 0.3},
+        {"counting_error_per_mm2": 0.2},
+        {"remedy": "scan it again"},
+        {"status": RegionStatus.RESCANNED},
+        {"history": (RegionMoment(3, RegionStatus.OPEN, 1.0, 0.5, "found"),)},
+    ],
+)
+def test_whatever_is_told_of_a_region_is_told_when_it_changes(change: dict[str, Any]) -> None:
+    told = RegionsTold()
+    told.news([region(1)])
+    assert told.news([region(1)])["regions"] == []
+    [news] = told.news([replace(region(1), **change)])["regions"]
+    assert news == replace(region(1), **change).to_dict()
