@@ -208,7 +208,10 @@ def _check_origin(rules: GuardRules, scope: Scope, headers: Headers, host: Autho
 def _check_media(headers: Headers) -> None:
     media = ",".join(headers.getlist("content-type")).lower()
     if "multipart/" in media or "x-www-form-urlencoded" in media:
-        raise _Refused(MEDIA_REFUSED, "Forms are not taken; send JSON, or the bytes themselves.")
+        raise _Refused(
+            MEDIA_REFUSED,
+            "Forms are not taken; send JSON, or the bytes of a file as application/octet-stream (curl -T FILE does).",
+        )
     coding = headers.get("content-encoding", "identity").strip().lower()
     if coding != "identity":
         raise _Refused(MEDIA_REFUSED, "Compressed bodies are not taken; send the body as it is.")

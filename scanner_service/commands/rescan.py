@@ -8,8 +8,8 @@ import httpx
 import typer
 from rich.table import Table
 
-from scanner_service.api.keys import read_local_key
 from scanner_service.commands.serve import DEFAULT_DATA, Data
+from scanner_service.commands.sessions import named, running_service
 from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json
 
 Serving = dict[str, Sequence[str | int | float | bool | None]]
@@ -18,7 +18,7 @@ _OVER = ("done", "failed", "cancelled")
 
 
 def rescan_command(
-    session: Annotated[str, typer.Argument(help="The session's id, or `latest`.")],
+    session: Annotated[str, typer.Argument(help="The session's id, its first letters, or `latest`.")],
     carry_out: Annotated[int | None, typer.Option("--pass", help="Carry out this pass of the list.")] = None,
     turned: Annotated[bool, typer.Option("--turned", help="The part lies as the pass asks.")] = False,
     auto: Annotated[bool, typer.Option("--auto", help="Repeat until nothing is left to do.")] = False,
@@ -33,19 +33,15 @@ def rescan_command(
 ) -> None:
     """List the recommended passes of a session, carry one out, or all of them by themselves."""
     with plain_errors():
-        key = read_local_key(data)
-        if key is None:
-            fail(f"there is no key in {data}: start `scanner serve` first, or name its folder with --data")
         if sum((auto, carry_out is not None, cancel is not None)) > 1:
             fail("say one of --pass, --auto and --cancel")
         serving: Serving = {"region": region or [], "reason": reason or []}
-        head = {"Authorization": f"Bearer {key}"}
-        with httpx.Client(base_url=url, headers=head, timeout=120.0) as client:
-            where = f"/api/v1/sessions/{_session_id(client, session)}"
+        with running_service(data, url) as client:
+            where = f"/api/v1/sessions/{named(client, session)}"
             if auto:
                 limits = {"max_passes": max_passes, "max_seconds": max_seconds}
-                named = {"regions": serving["region"], "reasons": serving["reason"]}
-                result = _loop(client, where, limits | named, as_json)
+                chosen = {"regions": serving["region"], "reasons": serving["reason"]}
+                result = _loop(client, where, limits | chosen, as_json)
             elif carry_out is not None:
                 result = _one(client, where, carry_out, turned, serving)
             elif cancel is not None:
@@ -61,15 +57,6 @@ def rescan_command(
             _tell_orders([result])
         else:
             _tell_plan(result)
-
-
-def _session_id(client: httpx.Client, wanted: str) -> str:
-    if wanted != "latest":
-        return wanted
-    found = _ask(client.get("/api/v1/sessions", params={"limit": 1}))["sessions"]
-    if not found:
-        fail("the service has no session yet: scan a part first")
-    return str(found[0]["id"])
 
 
 def _loop(client: httpx.Client, where: str, limits: dict[str, Any], quiet: bool) -> dict[str, Any]:

@@ -51,7 +51,7 @@ def ask(client: httpx.Client, method: str, path: str, **said: Any) -> Any:
     return answer.json() if answer.content else None
 
 
-def _named(client: httpx.Client, wanted: str) -> str:
+def named(client: httpx.Client, wanted: str) -> str:
     """The whole id of the session that is meant."""
 
     def ids() -> Iterator[str]:
@@ -102,7 +102,7 @@ def show_command(
 ) -> None:
     """What a session is doing, and what became of every line of it."""
     with plain_errors(), running_service(data, url) as client:
-        session_id = _named(client, session_id)
+        session_id = named(client, session_id)
         _open(client, session_id, quiet=as_json)
         status = ask(client, "GET", _path(session_id))
         if as_json:
@@ -149,7 +149,7 @@ def open_command(
 ) -> None:
     """Reopen a session: its live map is built again from the record, with a progress bar."""
     with plain_errors(), running_service(data, url) as client:
-        session_id = _named(client, session_id)
+        session_id = named(client, session_id)
         _open(client, session_id, quiet=as_json)
         status = ask(client, "GET", _path(session_id))
         if as_json:
@@ -189,7 +189,7 @@ def _telling(verb: str, told: str) -> None:
         session_id: SessionId, data: Data = DEFAULT_DATA, url: Url = DEFAULT_URL, as_json: AsJson = False
     ) -> None:
         with plain_errors(), running_service(data, url) as client:
-            status = ask(client, "POST", _path(_named(client, session_id), f"/{verb}"))
+            status = ask(client, "POST", _path(named(client, session_id), f"/{verb}"))
             if as_json:
                 show_json(status)
             else:
@@ -216,7 +216,7 @@ def note_command(
 ) -> None:
     """Keep notes with a session."""
     with plain_errors(), running_service(data, url) as client:
-        row = ask(client, "PATCH", _path(_named(client, session_id)), json={"notes": text})
+        row = ask(client, "PATCH", _path(named(client, session_id)), json={"notes": text})
         if as_json:
             show_json(row)
         else:
