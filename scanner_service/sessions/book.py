@@ -16,7 +16,7 @@ from scanner_service.sessions.references import Nominal, nominal_of
 from scanner_service.sessions.retention import OVER, Kept, Retention, choose
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
-from scanner_service.sessions.source_specs import PushSpec, SourceSpec
+from scanner_service.sessions.source_specs import PushSpec, SourceSpec, let_go
 from scanner_service.sessions.sources import PushSource, Source, SpentSource
 from scanner_service.sessions.withdrawals import SERVICE_ENDED
 from scanner_service.storage.errors import RecordError
@@ -94,6 +94,22 @@ class SessionBook:
         CreationKeyReused : the key came before, with another request.
         RecordError : the session could not be recorded.
         """
+        try:
+            return self._create_once(name, spec, settings, origin_mm, source, key, reference)
+        except BaseException:
+            let_go(spec)
+            raise
+
+    def _create_once(
+        self,
+        name: str,
+        spec: SourceSpec,
+        settings: SessionSettings | None,
+        origin_mm: Sequence[float],
+        source: Source | None,
+        key: CreationKey | None,
+        reference: ReferenceSurface | None,
+    ) -> LiveSession:
         if key is None:
             return self._create(name, spec, settings, origin_mm, source, None, reference)
         with self._lock:
@@ -101,7 +117,11 @@ class SessionBook:
                 raise SessionBusy("the same request is being carried out; ask again in a moment")
             self._creating.add(key.key_sha256)
         try:
-            return self.made_with(key) or self._create(name, spec, settings, origin_mm, source, key, reference)
+            made = self.made_with(key)
+            if made is not None:
+                let_go(spec)
+                return made
+            return self._create(name, spec, settings, origin_mm, source, key, reference)
         finally:
             with self._lock:
                 self._creating.discard(key.key_sha256)

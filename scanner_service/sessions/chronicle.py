@@ -4,20 +4,25 @@ A record that cannot be written for a while must not stop the scan: what it miss
 """
 
 import logging
-from collections import deque
+import threading
+import time
+from collections import Counter, deque
 from collections.abc import Mapping
 from typing import Any
 
 from scanner_service.sessions.ledger import Ledger
-from scanner_service.storage.errors import RecordError
+from scanner_service.storage.errors import NotStorable, RecordError
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import WriterState
 
 _LOG = logging.getLogger(__name__)
 _STATE_PATIENCE_S = 2.0
 _MOST_OWED = 1000
+_LAST_PATIENCE_S = 2.0
 
 RECORD_RESUMED = "record_resumed"
+EVENTS_LOST = "events_lost"
+"""Stands where events are missing, and tells how many by reason."""
 
 
 class Chronicle:
@@ -26,17 +31,23 @@ class Chronicle:
     def __init__(self, record: Record, session_id: str) -> None:
         self._record = record
         self._session_id = session_id
-        self._owed: deque[tuple[str, dict[str, Any]]] = deque(maxlen=_MOST_OWED)  # events that the disk did not take
+        self._owed: deque[tuple[str, dict[str, Any]]] = deque()  # events that the disk did not take yet
+        self._lost: Counter[str] = Counter()  # events that stood before the first that is owed
+        self._pen = threading.Lock()  # whoever holds it writes: events stand in the order in which they came
         self._kept: Mapping[str, Any] | None = None  # the account of losses that was written last
         self._disk = _DiskWatch()
 
     def event(self, kind: str, details: dict[str, Any], patience_s: float = 1.0) -> None:
-        """Write an event down, now or when the record can be written again."""
-        try:
-            self._record.append_event(self._session_id, kind, details, timeout_s=patience_s)
-        except RecordError:
-            _LOG.warning("the event %s of session %s will be recorded later", kind, self._session_id)
+        """Write an event down behind those that are owed, now or when the record can be written again."""
+        with self._pen:
             self._owed.append((kind, details))
+            if self._write_owed(patience_s):
+                return
+            _LOG.warning("the event %s of session %s will be recorded later", kind, self._session_id)
+            if len(self._owed) > _MOST_OWED:
+                gone, _ = self._owed.popleft()
+                self._lost["record_busy"] += 1
+                _LOG.warning("the event %s of session %s is lost: too many wait for the disk", gone, self._session_id)
 
     def state(self, state: str) -> None:
         """Write the state down; waits a little until it is durable."""
@@ -64,8 +75,9 @@ class Chronicle:
 
     def watch_the_disk(self, ledger: Ledger, now_s: float) -> None:
         """Tell the record, once it can be written again, what it missed, and that it could not be."""
-        if self._owed and self._record.writer_state().state == "ok":
-            self.event(*self._owed.popleft())
+        if self._record.writer_state().state == "ok":
+            with self._pen:
+                self._write_owed(0.0)
         told = self._disk.look(self._record.writer_state(), ledger, now_s)
         if told is not None:
             self.event(RECORD_RESUMED, told)
@@ -79,6 +91,34 @@ class Chronicle:
             f"the record cannot be written ({writer.reason}): {writer.waiting_lines} lines wait in memory and "
             f"{writer.refused} were lost; free space on its disk, and it goes on by itself"
         )
+
+    def close(self) -> None:
+        """Write what is still owed; what the record does not take now is lost, and said in the log."""
+        with self._pen:
+            if not self._write_owed(_LAST_PATIENCE_S):
+                number = len(self._owed) + self._lost.total()
+                _LOG.error("%d events of session %s are lost: the record took none", number, self._session_id)
+
+    def _write_owed(self, patience_s: float) -> bool:
+        """Write what is owed, in order, until the record takes no more; True when all is written."""
+        until_s = time.monotonic() + patience_s
+        while self._lost or self._owed:
+            kind, details = (EVENTS_LOST, dict(self._lost)) if self._lost else self._owed[0]
+            try:
+                left_s = max(0.0, until_s - time.monotonic())
+                self._record.append_event(self._session_id, kind, details, timeout_s=left_s)
+            except NotStorable as error:  # now and for ever: those behind it must not wait for it
+                _LOG.warning("the event %s of session %s cannot be recorded: %s", kind, self._session_id, error)
+                self._owed.popleft()
+                self._lost["not_storable"] += 1
+                continue
+            except RecordError:
+                return False
+            if self._lost:
+                self._lost.clear()
+            else:
+                self._owed.popleft()
+        return True
 
 
 class _DiskWatch:

@@ -8,6 +8,8 @@ import os
 import re
 import secrets
 import shutil
+import stat
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -26,7 +28,9 @@ RESERVE_BYTES = 1 << 30
 
 MOST_ARRIVING = 2
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._()+-]{0,119}")
-_BESIDE = ("-wal", "-shm")  # what SQLite leaves beside a record that was read
+_TEXTS_AND_CLOUDS = (".asc", ".csv", ".e57", ".las", ".laz", ".pcd", ".ply", ".pts", ".tsv", ".txt", ".xyz")
+_ENDINGS = (*_TEXTS_AND_CLOUDS, ".raw", ".gz", ".db", ".sqlite", ".sqlite3")
+_BESIDE = ("-wal", "-shm", "-journal")  # what SQLite leaves beside a record, and believes when it finds it there
 _HEAD_BYTES = 1 << 16
 _LOOK_EVERY_BYTES = 16 << 20
 
@@ -52,23 +56,25 @@ class FileShelf:
         self.folder = folder
         self._arriving = arriving
         self._free_bytes = free_bytes
+        self._door = threading.Lock()
         shutil.rmtree(arriving, ignore_errors=True)  # what an earlier process did not finish
         arriving.mkdir(mode=0o700)
 
     def files(self) -> list[ShelfFile]:
         """What lies there, by name."""
-        return [
-            ShelfFile(item.name, item.stat().st_size, _kind(item))
+        shown = (
+            item
             for item in sorted(self.folder.iterdir())
-            if item.is_file() and not item.name.startswith(".") and not item.name.endswith(_BESIDE)
-        ]
+            if not item.name.startswith(".") and not item.name.endswith(_BESIDE)
+        )
+        return [file for file in map(_look_at, shown) if file is not None]
 
     def receive(self, name: str, declared_bytes: int | None) -> "Arrival":
         """Begin to take in a file, of which `declared_bytes` are said to come.
 
         Raises
         ------
-        SourceUnusable : the name is no bare file name, or the file is too large.
+        SourceUnusable : the name is no bare file name of a kind that is read here, or the file is too large.
         SessionBusy : too many files arrive at once.
         BudgetSpent : the disk is too full.
         """
@@ -76,12 +82,17 @@ class FileShelf:
             raise SourceUnusable(
                 "a file is named by at most 120 letters, digits, spaces and . _ ( ) + -, a letter first"
             )
-        if len(list(self._arriving.iterdir())) >= MOST_ARRIVING:
-            raise SessionBusy(f"{MOST_ARRIVING} files arrive already; send this one when they are here")
-        self.check_room(declared_bytes or 0)
+        if not name.lower().endswith(_ENDINGS):
+            endings = f"{', '.join(_ENDINGS[:-1])} or {_ENDINGS[-1]}"
+            raise SourceUnusable(f"nothing that is read here is named like {name}: let the name end in {endings}")
         if declared_bytes is not None and declared_bytes > MAX_FILE_BYTES:
             raise _too_large(name)
-        return Arrival(self, name, self._arriving / secrets.token_hex(8))
+        with self._door:  # counted and opened in one go
+            here = [item for item in self._arriving.iterdir() if not item.name.endswith(_BESIDE)]
+            if len(here) >= MOST_ARRIVING:
+                raise SessionBusy(f"{MOST_ARRIVING} files arrive already; send this one when they are here")
+            self.check_room(declared_bytes or 0)
+            return Arrival(self, name, self._arriving / secrets.token_hex(8))
 
     def check_room(self, more_bytes: int) -> None:
         """Raise BudgetSpent when so much more would take what is kept free."""
@@ -163,6 +174,15 @@ class Arrival:
     ) -> None:
         self._file.close()
         self._beside.unlink(missing_ok=True)
+
+
+def _look_at(path: Path) -> ShelfFile | None:
+    """What lies there; None for what is no file, or was removed meanwhile."""
+    try:
+        seen = path.stat()
+    except OSError:
+        return None
+    return ShelfFile(path.name, seen.st_size, _kind(path)) if stat.S_ISREG(seen.st_mode) else None
 
 
 def _kind(path: Path) -> str | None:

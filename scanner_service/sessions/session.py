@@ -261,6 +261,7 @@ class LiveSession:
             self._closing.set()
             if self._analyst.is_alive():
                 self._analyst.join()
+            self._chronicle.close()
             self.engine.close()
 
     def mark_region(self, region_id: int, status: RegionStatus, why: str) -> None:

@@ -172,8 +172,15 @@ class RecordSpec:
     def open(self) -> Source:
         """A source that plays the stored lines as they are, without the passes that were withdrawn.
 
-        Raises SourceUnusable.
+        Raises SourceUnusable; the record is closed then, if it is the source's to close.
         """
+        try:
+            return self._open()
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self) -> Source:
         events = list(self.reader.events(self.session.session_id))
         gone, kept = withdrawn_passes(events), calibration_after(self.session.calibration, events)
         lines = (line for _, line in self.reader.lines(self.session.session_id) if pass_key(line) not in gone)
@@ -201,3 +208,9 @@ class PushSpec:
 
 
 SourceSpec = DeviceSpec | RigSpec | ReplaySpec | RecordSpec | PushSpec
+
+
+def let_go(spec: SourceSpec) -> None:
+    """Close what a spec holds that will not be opened any more; perhaps twice."""
+    if isinstance(spec, RecordSpec):
+        spec.close()

@@ -23,7 +23,15 @@ OLDEST_SQLITE = (3, 37, 0)
 PAGE_BYTES = 8192
 _MAGIC = b"SQLite format 3\0"
 _USER_VERSION, _APPLICATION = slice(60, 64), slice(68, 72)  # places in the header of an SQLite file
-_IS_ODD = "type NOT IN ('table', 'index') OR sql LIKE '%VIRTUAL%' OR sql LIKE '%GENERATED%' OR sql LIKE '% AS (%'"
+MOST_VALUE_BYTES = 64 << 20
+"""What one row or value of a record that others may have written takes at most; a line takes some hundred kilobytes."""
+
+_ODD_PARTS = "SELECT count(*) FROM main.sqlite_master WHERE type NOT IN ('table', 'index') OR sql LIKE '%VIRTUAL%'"
+# SQLite's own reading of the schema, in whatever words that is written: `hidden` is 0 for a column that is stored as is
+_ODD_COLUMNS = """
+SELECT count(*) FROM pragma_table_list AS part LEFT JOIN pragma_table_xinfo(part.name) AS piece
+WHERE part.schema = 'main' AND (part.type <> 'table' OR piece.hidden <> 0)
+"""
 _WRITER_WAITS_S = 0.2
 _READER_WAITS_S = 5.0
 
@@ -131,7 +139,7 @@ def check_identity(connection: sqlite3.Connection, path: Path) -> int:
         application = connection.execute("PRAGMA application_id").fetchone()[0]
         version = connection.execute("PRAGMA user_version").fetchone()[0]
         connection.execute("PRAGMA trusted_schema=0")
-        odd = connection.execute("SELECT count(*) FROM sqlite_master WHERE " + _IS_ODD).fetchone()[0]
+        odd = any(connection.execute(query).fetchone()[0] for query in (_ODD_PARTS, _ODD_COLUMNS))
     except sqlite3.DatabaseError as error:
         raise NotARecord(f"{path} cannot be opened as a record: {error}; choose another file") from error
     except UnicodeDecodeError as error:  # SQLite quotes damaged text in its message
@@ -321,11 +329,14 @@ def writer_engine(path: Path, factory: type[sqlite3.Connection]) -> Engine:
     return engine
 
 
-def reader_engine(path: Path) -> Engine:
-    """An engine whose connections can neither write nor checkpoint."""
+def reader_engine(path: Path, most_value_bytes: int | None = None) -> Engine:
+    """An engine whose connections can neither write nor checkpoint, nor read a longer row or value than is said."""
 
     def connect() -> sqlite3.Connection:
         connection = _connect(path, "ro", _READER_WAITS_S, sqlite3.Connection)
+        if most_value_bytes is not None:
+            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, most_value_bytes)
+        connection.execute("PRAGMA trusted_schema=0")
         connection.execute("PRAGMA query_only=1")
         connection.execute("PRAGMA mmap_size=0")
         return connection

@@ -15,7 +15,13 @@ from sqlalchemy.exc import DBAPIError
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey
 from scanner_service.storage.batch import SESSION_COLUMNS, session_from, session_made_with
-from scanner_service.storage.database import check_identity, reader_engine, structure_problems, used_bytes
+from scanner_service.storage.database import (
+    MOST_VALUE_BYTES,
+    check_identity,
+    reader_engine,
+    structure_problems,
+    used_bytes,
+)
 from scanner_service.storage.encoding import decode_line
 from scanner_service.storage.errors import LineDamaged, NotARecord, RecordUnreadable, SessionUnknown
 from scanner_service.storage.postgres import PostgresSchema, is_url
@@ -70,10 +76,11 @@ class RecordReader:
             raise NotARecord(f"there is no record {path}")
         try:
             with closing(sqlite3.connect(f"{path.as_uri()}?mode=ro", uri=True)) as connection:
+                connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_VALUE_BYTES)
                 schema = check_identity(connection, path)
         except sqlite3.Error as error:
             raise NotARecord(f"the record {path} cannot be read: {error}") from error
-        return cls(reader_engine(path), schema)
+        return cls(reader_engine(path, MOST_VALUE_BYTES), schema)
 
     def close(self) -> None:
         """Let go of the file."""

@@ -169,7 +169,11 @@ def create_session(
         if body.model_fields_set & {"settings", "origin_mm"}:
             spec.close()
             raise SourceUnusable("a session of a record is played with its own settings and origin: leave them out")
-        settings, origin_mm = SessionSettings.from_dict(spec.session.settings), spec.session.origin_mm
+        try:
+            settings, origin_mm = SessionSettings.from_dict(spec.session.settings), spec.session.origin_mm
+        except BaseException:
+            spec.close()
+            raise
     elif settings.reference is not None:
         reference, named = open_reference(settings.reference, request.app.state.service.replay_dir)
         settings = replace(settings, reference=named)

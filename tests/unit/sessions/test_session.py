@@ -1,6 +1,8 @@
 """A session's ends: by its user, by its source, by a fault; and what is let go of then."""
 
+import os
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +14,10 @@ from scanner_service.sessions.errors import SessionBusy, SourceUnusable
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec
 from scanner_service.sessions.sources import DeviceSource, PassRequest, ReplaySource
+from scanner_service.storage.errors import CreationKeyReused
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
+from scanner_service.storage.rows import CreationKey
 from tests.unit.analysis.scans import scanline, surface_scan
 
 SETTINGS = SessionSettings(max_points=20_000)
@@ -136,3 +140,35 @@ def test_a_record_is_replayed_at_a_pace_or_not_at_all(book, speed, tmp_path):
     with pytest.raises(SourceUnusable, match="greater than 0"):
         RecordSpec.find(reader, session.row.session_id, speed).open()
     reader.close()
+
+
+def times_open(path):
+    """How often this process holds a file open."""
+    held = Path("/proc/self/fd")
+    return sum(os.path.realpath(one) == str(path) for one in held.iterdir())
+
+
+@pytest.fixture
+def other(tmp_path):
+    """The file of another service's record, with one session."""
+    with Record.open(tmp_path / "other.sqlite") as record:
+        record.create_session("other", settings=SETTINGS.to_dict(), source=PushSpec().to_dict())
+    return tmp_path / "other.sqlite"
+
+
+def test_a_record_is_let_go_of_when_no_session_is_made_of_it(book, other, monkeypatch):
+    with monkeypatch.context() as full:
+        full.setattr("scanner_service.sessions.book.MAX_LIVE", 0)
+        for _ in range(3):
+            with pytest.raises(SessionBusy):
+                book.create("refused", RecordSpec.of_file(other, None, None))
+    with pytest.raises(SourceUnusable, match="greater than 0"):
+        RecordSpec.of_file(other, None, -1.0).open()
+    key = CreationKey("a" * 64, "b" * 64)
+    made = book.create("made", RecordSpec.of_file(other, None, None), key=key)
+    made.start()
+    assert made.wait_until_over(30)
+    assert book.create("made", RecordSpec.of_file(other, None, None), key=key) is made
+    with pytest.raises(CreationKeyReused):
+        book.create("made", RecordSpec.of_file(other, None, None), key=CreationKey("a" * 64, "c" * 64))
+    assert times_open(other) == 0
