@@ -171,9 +171,11 @@ def create_session(
             raise SourceUnusable("a session of a record is played with its own settings and origin: leave them out")
         try:
             settings, origin_mm = SessionSettings.from_dict(spec.session.settings), spec.session.origin_mm
-        except BaseException:
+        except (TypeError, ValueError, AttributeError) as error:
             spec.close()
-            raise
+            raise SourceUnusable(
+                f"the settings of the recorded session are none that are known here: {error}"
+            ) from None
     elif settings.reference is not None:
         reference, named = open_reference(settings.reference, request.app.state.service.replay_dir)
         settings = replace(settings, reference=named)
