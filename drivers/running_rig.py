@@ -18,6 +18,7 @@ from drivers.passes.drive import PassDrive
 from drivers.passes.in_motion import MotionPass
 from drivers.passes.left_out import LeftOut, WirePass, without
 from drivers.passes.lines import PassLines
+from drivers.passes.stopping import Stopping
 from drivers.passes.told import RigEvent, RigPassEnded, Told
 from drivers.passes.with_device import run_with_device
 from drivers.port_names import find_port
@@ -66,7 +67,7 @@ class RunningRig:
         self._told = Told()
         self._left_out = LeftOut()
         self._lines: PassLines | None = None
-        self._stopping = threading.Event()
+        self._stopping = Stopping()
         self._thread: threading.Thread | None = None
 
     def __enter__(self) -> Self:
@@ -81,7 +82,11 @@ class RunningRig:
     # ---- what a user does -------------------------------------------------------------------------------------------
 
     def enter(self) -> DeviceInfo:
-        """Connect to scanner and stage; raises a DriverError, and then neither is left open."""
+        """Connect to scanner and stage; raises a DriverError, and then neither is left open.
+
+        A stop of an earlier time is forgotten, one that comes meanwhile is not.
+        """
+        self._stopping = Stopping()
         info = self._scanner.enter()
         try:
             self._stage.enter()
@@ -120,24 +125,28 @@ class RunningRig:
         Raises
         ------
         DriverError : when it cannot be driven here; nothing has moved, and the laser is off.
+        StageStopped : after `stop`, until the rig is entered anew.
         """
         if self._thread is not None and self._thread.is_alive():
             raise DriverError("a pass is under way; stop it first")
         self._refuse(order)
-        self._stopping.clear()
         lines = PassLines(self._rig, order, self._description.pairing, self._told, self._left_out)
-        self._lines = lines
-        self._thread = threading.Thread(
+        thread = threading.Thread(
             target=self._drive, args=(order, lines), name=f"rig {self._description.name}", daemon=True
         )
-        self._thread.start()
+        with self._stopping.before_it():
+            thread.start()
+            self._lines, self._thread = lines, thread
 
     def events(self, timeout_s: float) -> list[RigEvent]:
         """Return scanlines and events since the last call, in order; waits at most `timeout_s` for the first."""
         return self._told.take(timeout_s)
 
     def stop(self) -> None:
-        """Stop the stage before anything else, then the scanner; returns when the pass is over."""
+        """Stop the stage before anything else, then the scanner; returns when the pass is over.
+
+        Nothing sets off afterwards, also where a `start` is about to come: see `enter`.
+        """
         self._stopping.set()
         if self._driven is not None:
             with contextlib.suppress(StageError):  # told by the pass itself, as its end

@@ -32,7 +32,7 @@ from drivers.protocols.unwrap import increase_u32, unwrap_u32
 
 _WINDOW = 65_536
 _MAX_GAPS = 1_024
-_MAX_PASSES = 1_024
+MAX_PASSES = 1_024
 OTHER_PASSES = -1
 """The pass under which everything is booked once a boot has told of more passes than can be kept apart."""
 
@@ -359,7 +359,7 @@ class BootLedger:
         account = self._passes.get(pass_index)
         if account is not None:  # so for every chunk but a pass' first: an account is not made to be thrown away
             return account
-        if len(self._passes) >= _MAX_PASSES:
+        if len(self._passes) >= MAX_PASSES:
             pass_index = OTHER_PASSES
         return self._passes.setdefault(pass_index, _PassAccount())
 

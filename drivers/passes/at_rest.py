@@ -1,6 +1,6 @@
 """A pass measured line by line: move to each place, wait until the stage rests, take one profile; knows no device."""
 
-from drivers.errors import ScannerSilent, StageStopped
+from drivers.errors import ScannerSilent
 from drivers.pairing import StagePosition
 from drivers.passes.drive import FIRST_PROFILE_S, LOOK_S, PassDrive
 from drivers.scanline import Profile
@@ -13,17 +13,16 @@ does not tell, then does no harm."""
 
 
 def run_at_rest(drive: PassDrive, scanner: FreeRunningScanner, stage: DrivenStage) -> None:
-    """Run the pass; raises a DriverError when stage or scanner fail."""
-    order, lines, speed = drive.order, drive.lines, drive.approach_speed
-    stage.move_to(order.start_mm, speed)
+    """Run the pass; raises a DriverError when stage or scanner fail, StageStopped when it is to end."""
+    order, lines = drive.order, drive.lines
+    drive.move_to(stage, order.start_mm)
+    drive.stopping.refuse()
     scanner.start_profiles()
     for profile in drive.first_profile():
         lines.only_clock(profile)
         lines.leave_out(profile, "between_stops")
     for number in range(order.line_count):
-        if drive.stopping.is_set():
-            return
-        reading = stage.move_to(order.position_mm(number), speed)
+        reading = drive.move_to(stage, order.position_mm(number))
         rests_since_s = drive.clock() + drive.description.pairing.latency_uncertainty_s
         profile = _profile_after(drive, rests_since_s)
         lines.at_position(profile, StagePosition(reading.position_mm, reading.uncertainty_mm))
@@ -43,8 +42,8 @@ def _profile_after(drive: PassDrive, time_s: float) -> Profile:
                 found = profile
             else:
                 lines.leave_out(profile, "between_stops")
-        if drive.stopping.is_set() and found is None:
-            raise StageStopped("the pass was stopped")
+        if found is None:
+            drive.stopping.refuse()
         if found is None and drive.clock() > give_up_s and drive.scanner.is_connected:
             raise ScannerSilent(f"the scanner has sent no profile for {FIRST_PROFILE_S:g} s")
     return found

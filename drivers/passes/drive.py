@@ -1,7 +1,6 @@
 """What every way of driving a pass shares: fetching, and waiting for profiles and readings; knows no device."""
 
 import math
-import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,6 +9,7 @@ from itertools import pairwise
 from drivers.errors import ScannerSilent
 from drivers.passes.lines import PassLines
 from drivers.passes.speeds import approach_speed, stage_speed
+from drivers.passes.stopping import Stopping
 from drivers.passes.told import Told
 from drivers.protocols.scanner_events import ScannerEvent
 from drivers.protocols.stage_events import StageEvent
@@ -17,10 +17,11 @@ from drivers.rig_description import PairBy, RigDescription
 from drivers.rig_limits import PassOrder
 from drivers.scanline import Profile
 from drivers.scanners.face import Scanner
-from drivers.stages.face import DrivenStage, Stage
+from drivers.stages.face import DrivenStage, Stage, StageReading
 from drivers.stages.unmoved import ConstantSpeed
 
 LOOK_S = 0.05
+_ARRIVAL_LOOK_S = 1.0
 FIRST_PROFILE_S = 10.0
 _MEASURE_RATE_S = 0.6
 _READING_S = 5.0
@@ -41,7 +42,7 @@ class PassDrive:
     lines: PassLines
     told: Told
     clock: Callable[[], float]
-    stopping: threading.Event
+    stopping: Stopping
     seen: "deque[ScannerEvent]" = field(default_factory=lambda: deque(maxlen=_MAX_EVENTS))
 
     @property
@@ -58,6 +59,19 @@ class PassDrive:
     def approach_speed(self) -> float:
         """How fast the stage goes to where lines begin, mm/s."""
         return approach_speed(self.description.limits)
+
+    def move_to(self, stage: DrivenStage, position_mm: float) -> StageReading:
+        """Go where lines begin and wait; raises a StageError, StageStopped once the pass is to end."""
+        self.start_move(stage, position_mm, self.approach_speed)
+        while (reading := stage.finish_move(_ARRIVAL_LOOK_S)) is None:
+            self.stopping.refuse()
+        self.stopping.refuse()  # the stage may rest where the stop left it
+        return reading
+
+    def start_move(self, stage: DrivenStage, position_mm: float, speed_mm_per_s: float) -> None:
+        """Set off; raises a StageError, StageStopped when the pass is to end, and then nothing was sent."""
+        with self.stopping.before_it():
+            stage.start_move(position_mm, speed_mm_per_s)
 
     def fetch(self, timeout_s: float) -> list[Profile]:
         """Return the profiles that came; events are noted in `seen` and handed on."""
@@ -85,12 +99,14 @@ class PassDrive:
             self.lines.by_time(profile)
 
     def first_profile(self) -> list[Profile]:
-        """Wait until the scanner measures: a stage that sets off earlier leaves the beginning unseen."""
+        """Wait until the scanner measures: a stage that sets off earlier leaves the beginning unseen.
+
+        Raises ScannerSilent, or StageStopped when the pass is to end meanwhile.
+        """
         give_up_s = self.clock() + FIRST_PROFILE_S
         while not (profiles := self.fetch(LOOK_S)):
             self.lines.read(self.stage.readings())
-            if self.stopping.is_set():
-                break
+            self.stopping.refuse()
             if self.clock() > give_up_s:
                 raise ScannerSilent(f"the scanner has sent no profile within {FIRST_PROFILE_S:g} s of its start")
         return profiles
@@ -99,7 +115,7 @@ class PassDrive:
         """Wait until the stage has said where it rests: twice, so that readings lie around the last profile."""
         since_s, give_up_s = self.clock(), self.clock() + _READING_S
         wanted = 2 if profiles_too else 1
-        while wanted and self.clock() < give_up_s:
+        while wanted and self.clock() < give_up_s and not self.stopping.is_set():
             for profile in self.fetch(LOOK_S):
                 self.enter_early(profile)
             readings = self.stage.readings()

@@ -5,7 +5,7 @@ import math
 from drivers.errors import ScannerSilent, StageNotConnected
 from drivers.passes.drive import LOOK_S, PassDrive
 from drivers.protocols.scanner_events import Advice, Disconnected, PassNotResumed, PassResumed, Reconnected
-from drivers.protocols.stage_events import StageReconnected
+from drivers.protocols.stage_events import StageDisconnected, StageReconnected
 from drivers.rig_description import PairBy
 from drivers.scanners.face import FreeRunningScanner
 from drivers.stages.unmoved import ConstantSpeed
@@ -25,14 +25,16 @@ class MotionPass:
         self._scanner = scanner
         self._by_count = drive.pairs_by is PairBy.COUNT
         self._speed = 0.0
+        self._stage_is_back = False  # it was gone and came back since it set off
         self._counted_mm = math.nan  # up to the last round before the stage arrived
 
     def run(self) -> None:
         """Move from end to end while the scanner measures; raises a DriverError when stage or scanner fail."""
         drive, order, lines = self._drive, self._drive.order, self._drive.lines
         if drive.driven is not None:
-            drive.driven.move_to(order.start_mm, drive.approach_speed)
+            drive.move_to(drive.driven, order.start_mm)
         drive.stage.readings()
+        drive.stopping.refuse()
         self._scanner.start_profiles()
         if not self._by_count:  # a scanner that is triggered by the stage measures nothing before it moves
             for profile in drive.first_profile():
@@ -40,18 +42,20 @@ class MotionPass:
         self._speed = drive.speed()
         self._set_off(order.start_mm)
         while not drive.stopping.is_set():
-            arrived = False
+            arrived = was_lost = stage_is_gone = False
             try:
                 arrived = drive.driven is not None and drive.driven.finish_move(0.0) is not None
             except StageNotConnected:
-                self._wait_for_stage()
+                was_lost, stage_is_gone = True, not self._stage_is_back
             self._take(LOOK_S)
-            if any(isinstance(event, Disconnected) for event in drive.seen):
-                self._wait_for_scanner()
-            drive.seen.clear()
+            if self._scanner_went() or was_lost:
+                self._wait_until_back(stage_is_gone=stage_is_gone)  # what it sees at its end is for the next round
+                arrived = False  # wherever it was, the stage has set off again
+            else:
+                drive.seen.clear()
             lines.read(drive.stage.readings())
             lines.settle()
-            drive.stage_events()
+            self._stage_is_gone(False)
             if arrived or self._is_beyond():
                 break
             self._counted_mm = lines.counted_to_mm
@@ -66,7 +70,8 @@ class MotionPass:
         drive = self._drive
         if drive.driven is not None:
             drive.await_reading()
-            drive.driven.start_move(drive.order.end_mm, self._speed)
+            self._stage_is_back = False
+            drive.start_move(drive.driven, drive.order.end_mm, self._speed)
         elif isinstance(drive.stage, ConstantSpeed):
             drive.stage.begin(from_mm, drive.order.end_mm)
         drive.lines.count_from(from_mm, drive.clock())
@@ -114,39 +119,65 @@ class MotionPass:
 
     # ---- interruptions ----------------------------------------------------------------------------------------------
 
-    def _wait_for_scanner(self) -> None:
-        """The scanner is gone: the stage stops, and goes on behind the last line when the scanner is back."""
+    def _scanner_went(self) -> bool:
+        """True when the scanner was gone since the latest look, back or not; raises ScannerSilent."""
+        self._scanner_is_gone(False)
+        return any(isinstance(event, Disconnected) for event in self._drive.seen)
+
+    def _scanner_is_gone(self, was_gone: bool) -> bool:
+        """Return whether the scanner is away after what was seen of it; raises ScannerSilent when it stays silent."""
+        gone = was_gone
+        for event in self._drive.seen:
+            match event:
+                case Disconnected():
+                    gone = True
+                case Reconnected() | PassResumed():
+                    gone = False
+                case PassNotResumed(reason=reason):
+                    raise ScannerSilent(reason)
+        return gone
+
+    def _wait_until_back(self, *, stage_is_gone: bool) -> None:
+        """Stage, scanner or both were gone: the stage rests, and goes on behind the last line when both are there.
+
+        They go and come back in any order, as they do on one USB hub; either may have come back already.
+        """
         drive = self._drive
+        scanner_is_gone = self._scanner_is_gone(False)
         if drive.driven is not None:
-            drive.driven.stop()
             drive.lines.stop_counting()
-        back = False
-        while not back:
+            try:
+                if not stage_is_gone:
+                    drive.driven.stop()
+            except StageNotConnected:
+                stage_is_gone = True
+        give_up_s = drive.clock() + _BACK_S
+        while stage_is_gone or scanner_is_gone:
             if drive.stopping.is_set():
                 return
+            if not stage_is_gone:
+                give_up_s = drive.clock() + _BACK_S
+            elif drive.clock() > give_up_s:
+                raise StageNotConnected(f"the stage did not come back within {_BACK_S:g} s")
             drive.seen.clear()
             self._take(LOOK_S)
-            refused = next((event for event in drive.seen if isinstance(event, PassNotResumed)), None)
-            if refused is not None:
-                raise ScannerSilent(refused.reason)
-            back = any(isinstance(event, Reconnected | PassResumed) for event in drive.seen)
+            scanner_is_gone = self._scanner_is_gone(scanner_is_gone)
+            stage_is_gone = self._stage_is_gone(stage_is_gone)
+        drive.seen.clear()
         self._go_on()
 
-    def _wait_for_stage(self) -> None:
-        """The stage is gone: when it is back and knows where it is, the pass goes on behind the last line."""
-        drive = self._drive
-        drive.lines.stop_counting()
-        give_up_s = drive.clock() + _BACK_S
-        while drive.clock() < give_up_s and not drive.stopping.is_set():
-            for event in drive.stage_events():
-                if isinstance(event, StageReconnected):
-                    if not event.position_kept:
-                        raise StageNotConnected("the stage came back without its position; home it, then scan the rest")
-                    self._go_on()
-                    return
-            self._take(LOOK_S)
-        if not drive.stopping.is_set():
-            raise StageNotConnected(f"the stage did not come back within {_BACK_S:g} s")
+    def _stage_is_gone(self, was_gone: bool) -> bool:
+        """Return whether the stage is away after what happened to it; raises StageNotConnected when it is lost."""
+        gone = was_gone
+        for event in self._drive.stage_events():
+            match event:
+                case StageDisconnected():
+                    gone, self._stage_is_back = True, False
+                case StageReconnected(position_kept=False):
+                    raise StageNotConnected("the stage came back without its position; home it, then scan the rest")
+                case StageReconnected():
+                    gone, self._stage_is_back = False, True
+        return gone
 
     def _go_on(self) -> None:
         drive = self._drive
@@ -156,5 +187,5 @@ class MotionPass:
         drive.lines.settle()
         last_mm = drive.lines.last_mm
         from_mm = drive.order.start_mm if math.isnan(last_mm) else last_mm
-        drive.driven.move_to(from_mm, drive.approach_speed)
+        drive.move_to(drive.driven, from_mm)
         self._set_off(from_mm)

@@ -6,23 +6,31 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from drivers.scanline import Profile
-from drivers.tally import OTHER_PASSES, PassTally
+from drivers.tally import MAX_PASSES, OTHER_PASSES, LineTally, PassTally
 
 WirePass = tuple[int, int]
 """(boot id, pass index): a pass by the scanner's own numbers."""
 
 
 class LeftOut:
-    """All that one rig has left out, by pass of the scanner and by reason; any thread may enter or read."""
+    """All that one rig has left out, by pass of the scanner and by reason; any thread may enter or read.
+
+    Of one boot as many passes are kept apart as the scanner's account keeps.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
+        self._kept_apart: Counter[int] = Counter()  # passes of each boot
         self._of_pass: dict[WirePass, Counter[tuple[str, bool]]] = {}
 
     def enter(self, profile: Profile, reason: str) -> None:
         """A profile became no line."""
         key = (profile.boot_id, profile.pass_index)
         with self._lock:
+            if key not in self._of_pass and self._kept_apart[profile.boot_id] >= MAX_PASSES:
+                key = (profile.boot_id, OTHER_PASSES)
+            elif key not in self._of_pass:
+                self._kept_apart[profile.boot_id] += 1
             self._of_pass.setdefault(key, Counter())[reason, profile.is_whole] += 1
 
     def counts(self) -> dict[WirePass, Counter[tuple[str, bool]]]:
@@ -37,21 +45,24 @@ def without(
     """Return the scanner's accounts with the lines that were left out moved from the stored to the lost ones.
 
     The chunks stay as they are: they came over the wire. What is counted in `left_out` must have been read before
-    `passes`, so that no line is taken off that was not stored yet.
+    `passes`, so that no line is taken off that was not stored yet. A pass that the scanner tells nothing of, as after
+    it was entered anew, has the lines that were left out, and no others.
     """
     found = dict(passes)
     for key, counts in left_out.items():
-        booked = key if key in found else (key[0], OTHER_PASSES)
-        if booked not in found:
-            continue
-        lines = found[booked].lines
+        others = (key[0], OTHER_PASSES)
+        booked = others if key not in found and others in found else key
+        total = sum(counts.values())
+        whole = sum(count for (_, is_whole), count in counts.items() if is_whole)
+        unknown = PassTally(lines=LineTally(sent=total, whole=whole, partial=total - whole))
+        told = found.get(booked, unknown)
+        lines = told.lines
         lost = Counter(lines.lost)
         for (reason, _), count in counts.items():
             lost[reason] += count
-        whole = sum(count for (_, is_whole), count in counts.items() if is_whole)
-        partial = sum(counts.values()) - whole
+        partial = total - whole
         found[booked] = replace(
-            found[booked],
+            told,
             lines=replace(
                 lines, whole=lines.whole - whole, partial=lines.partial - partial, lost=dict(sorted(lost.items()))
             ),

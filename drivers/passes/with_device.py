@@ -1,8 +1,9 @@
 """A pass of a scanner that has a stage of its own, or reads an encoder: its lines bring their places; knows no wire."""
 
+import contextlib
 import math
 
-from drivers.errors import ScannerSilent
+from drivers.errors import ScannerSilent, StageStopped
 from drivers.pairing import StagePosition
 from drivers.passes.drive import LOOK_S, PassDrive
 from drivers.passes.speeds import line_rate
@@ -23,10 +24,12 @@ def run_with_device(drive: PassDrive, scanner: NativeScanner) -> str:
     rate_hz = line_rate(drive.description.limits, order)
     by_time = drive.pairs_by is PairBy.TIME
     if drive.driven is not None:
-        drive.driven.move_to(order.start_mm, drive.approach_speed)
+        drive.move_to(drive.driven, order.start_mm)
+    drive.stopping.refuse()
     scanner.start_pass(order.line_spacing_mm, order.start_mm, order.end_mm, rate_hz)
     if drive.driven is not None:
-        drive.driven.start_move(order.end_mm, rate_hz * order.line_spacing_mm)
+        with contextlib.suppress(StageStopped):  # a stop that came first ends the scanner's pass below
+            drive.start_move(drive.driven, order.end_mm, rate_hz * order.line_spacing_mm)
     elif isinstance(drive.stage, ConstantSpeed):
         drive.stage.begin(order.start_mm, order.end_mm)
     while True:

@@ -22,6 +22,7 @@ from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.sources import Sink, tell_scanner_event
 
 _LOG = logging.getLogger(__name__)
+_PREPARING_LOOK_S = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,7 @@ class RigSource:
         self._preparation = preparation
         self._position_mm = order.start_mm
         self._stopping = threading.Event()
+        self._is_preparing = True
         self._thread: threading.Thread | None = None
 
     def start(self, sink: Sink) -> None:
@@ -72,6 +74,9 @@ class RigSource:
         if self._thread is None:  # never started: nobody else lets go of the ports
             self._rig.exit()
         elif self._thread is not threading.current_thread():
+            while self._is_preparing and self._thread.is_alive():  # a homing may have begun behind the stop
+                self._thread.join(_PREPARING_LOOK_S)
+                self._rig.stop()
             self._thread.join()
 
     def tally(self) -> dict[str, Any] | None:
@@ -91,7 +96,10 @@ class RigSource:
     def _pump(self, sink: Sink) -> None:
         failure: str | None = None
         try:
-            self._prepare()
+            try:
+                self._prepare()
+            finally:
+                self._is_preparing = False
             if not self._stopping.is_set():
                 self._rig.start(self._order)
                 failure = self._follow(sink)
@@ -105,7 +113,7 @@ class RigSource:
         sink.ended(failure)
 
     def _prepare(self) -> None:
-        if not self._rig.is_driven:
+        if not self._rig.is_driven or self._stopping.is_set():
             return
         stage = cast(DrivenStage, self._rig.stage)
         if self._preparation.home:

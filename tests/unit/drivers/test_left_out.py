@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from drivers.passes.left_out import LeftOut, without
 from drivers.protocols.profile_account import ProfileAccount
 from drivers.scanline import Profile
+from drivers.tally import MAX_PASSES
 
 REASONS = ("outside_pass", "between_stops", "no_position")
 
@@ -97,3 +98,26 @@ def test_lines_lost_at_the_end_of_a_pass_are_that_pass_s_and_those_before_the_ne
     assert passes[1, 1].lines.lost == {"missing": at_the_end}
     assert sum(passes[1, 2].lines.lost.values()) == before_the_next
     assert (passes[1, 1].lines.stored, passes[1, 2].lines.stored) == (taken, taken)
+
+
+def test_what_was_left_out_of_a_pass_that_the_scanner_tells_nothing_of_is_told_as_lost() -> None:
+    left_out = LeftOut()
+    for line, whole in enumerate((True, True, False)):
+        left_out.enter(profile(3, 1, line, whole=whole), "outside_pass")
+    told = without({}, left_out.counts())
+    assert told[3, 1].lines.balances
+    assert (told[3, 1].lines.sent, told[3, 1].lines.lost) == (3, {"outside_pass": 3})
+
+
+def test_passes_beyond_those_that_the_scanner_keeps_apart_share_one_account_and_still_balance() -> None:
+    account, left_out = ProfileAccount(boot_id=7), LeftOut()
+    for _ in range(MAX_PASSES + 50):
+        account.begin_pass()
+        account.enter()
+        account.handed_on({}, whole=True)
+        left_out.enter(profile(7, account.pass_index, account.latest_line, whole=True), "outside_pass")
+        account.end_pass()
+    assert len(left_out.counts()) == MAX_PASSES + 1
+    passes = without(account.tally().passes, left_out.counts())
+    assert all(told.lines.balances and told.lines.stored == 0 for told in passes.values())
+    assert sum(told.lines.lost["outside_pass"] for told in passes.values()) == MAX_PASSES + 50

@@ -1,0 +1,200 @@
+"""Passes under stops and interruptions at any moment: nothing sets off after a stop, and nothing waits for ever."""
+
+import contextlib
+import itertools
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from drivers.errors import StageStopped
+from drivers.passes.at_rest import run_at_rest
+from drivers.passes.in_motion import MotionPass
+from drivers.passes.stopping import Stopping
+from drivers.passes.told import RigPassEnded, Told
+from drivers.passes.with_device import run_with_device
+from drivers.protocols.scanner_events import Advice, ClockJumped
+from drivers.rig_file import parse_rig
+from drivers.running_rig import RunningRig
+from drivers.scanline import Scanline
+from scanner_service.sessions.rig_source import Preparation, RigSource
+from tests.unit.drivers.pass_bench import AT_REST, ORDER, BenchScanner, BenchStage, Workshop, bench
+
+PASSES = {
+    "in motion": (ORDER, lambda drive: MotionPass(drive, drive.scanner).run()),
+    "at rest": (AT_REST, lambda drive: run_at_rest(drive, drive.scanner, drive.driven)),
+    "with device": (ORDER, lambda drive: run_with_device(drive, drive.scanner)),
+}
+RIG = """
+name = "bench"
+[scanner]
+kind = "scip"
+port = "/dev/scanner"
+field_of_view_mm = [-50, 50]
+[stage]
+kind = "grbl"
+port = "/dev/stage"
+travel_mm = [-100, 100]
+speed_mm_per_s = [0, 20]
+[mounting]
+stage_from_sensor = { translation_mm = [0, 0, 0] }
+[pairing]
+by = "time"
+"""
+
+
+@pytest.mark.parametrize("kind", PASSES)
+@pytest.mark.parametrize("moment", [*range(13), 20, 30])
+def test_nothing_sets_off_after_a_stop_at_any_moment(kind, moment):
+    order, run = PASSES[kind]
+    shop, stage, _, drive = bench(order)
+
+    def stop(number):
+        if number == moment:
+            shop.at_call = lambda _number: None
+            drive.stopping.set()
+            shop.sent.append("stopping")
+            stage.stop()
+
+    shop.at_call = stop
+    if moment == 0:
+        stop(0)
+    with contextlib.suppress(StageStopped):
+        run(drive)
+    after = shop.sent[shop.sent.index("stopping") + 1 :]
+    assert set(after) <= {"stop"}, shop.sent
+
+
+def test_a_stop_comes_after_what_sets_off_at_that_moment(monkeypatch):
+    monkeypatch.setattr("drivers.passes.stopping._SETTING_OFF_S", 600.0)  # however long this machine is held up
+    stopping, sent = Stopping(), []
+    stopper = threading.Thread(target=lambda: (stopping.set(), sent.append("stop")))
+    with stopping.before_it():
+        stopper.start()
+        while not stopping.is_set():
+            pass
+        sent.append("move")
+    stopper.join()
+    assert sent == ["move", "stop"]
+    with pytest.raises(StageStopped), stopping.before_it():
+        sent.append("move")
+    assert sent == ["move", "stop"]
+
+
+ORDERS = [
+    order
+    for order in itertools.permutations(("stage-", "stage+", "scanner-", "scanner+"))
+    if order.index("stage-") < order.index("stage+") and order.index("scanner-") < order.index("scanner+")
+]
+
+
+@pytest.mark.parametrize("looks_apart", [0, 1, 4])
+@pytest.mark.parametrize("order", ORDERS)
+def test_stage_and_scanner_that_go_and_come_back_in_any_order_go_on_to_the_end(order, looks_apart):
+    shop, stage, scanner, drive = bench()
+    happens = {
+        "stage-": stage.unplug,
+        "stage+": stage.replug,
+        "scanner-": scanner.unplug,
+        "scanner+": scanner.replug,
+    }
+    for number, name in enumerate(order):
+        look = 10 + number * looks_apart
+        earlier = shop.at_look.get(look, lambda: None)
+        shop.at_look[look] = lambda earlier=earlier, name=name: (earlier(), happens[name]())
+    MotionPass(drive, scanner).run()
+    at_mm = np.array([line.position_mm for line in drive.told.take(0.0) if isinstance(line, Scanline)])
+    assert at_mm.max() == pytest.approx(10.0, abs=0.51)
+    assert np.diff(np.sort(at_mm)).max() < 0.51
+
+
+def rig(makes_stage=BenchStage):
+    shop = Workshop()
+    stage, scanner = makes_stage(shop), BenchScanner(shop)
+    return stage, RunningRig(parse_rig(RIG), scanner=scanner, stage=stage, clock=shop.clock)
+
+
+def ended(running):
+    while True:
+        for event in running.events(1.0):
+            if isinstance(event, RigPassEnded):
+                return event
+
+
+def test_a_rig_that_was_stopped_sets_off_again_only_when_it_is_entered_anew():
+    stage, running = rig()
+    running.enter()
+    running.stop()
+    with pytest.raises(StageStopped, match="entered anew"):
+        running.start(ORDER)
+    assert stage.shop.sent == ["stop"]
+    running.enter()
+    running.start(ORDER)
+    assert ended(running).reason == "reached_end"
+    running.exit()
+
+
+def test_a_stop_while_a_pass_is_about_to_start_is_not_forgotten():
+    stage, running = rig()
+    running.enter()
+    stage.at_known = running.stop  # asked within `start`, behind every check of whoever calls it
+    with pytest.raises(StageStopped):
+        running.start(ORDER)
+    assert stage.shop.sent == ["stop"]
+
+
+class SlowToHome(BenchStage):
+    """Its homing begins only after somebody's stop, and lasts until the next one."""
+
+    def __init__(self, shop):
+        super().__init__(shop)
+        self.asked, self.first_stop, self.homing, self.next_stop = (threading.Event() for _ in range(4))
+
+    def home(self):
+        self.asked.set()
+        assert self.first_stop.wait(30.0)
+        self.homing.set()
+        assert self.next_stop.wait(30.0), "the homing goes on after the stop"
+        raise StageStopped("stopped")
+
+    def stop(self):
+        super().stop()
+        (self.next_stop if self.homing.is_set() else self.first_stop).set()
+
+
+class Ended:
+    """A sink that only wants to know how it ended."""
+
+    def __init__(self):
+        self.failures = []
+
+    def ended(self, failure):
+        self.failures.append(failure)
+
+
+def test_a_homing_that_begins_behind_the_stop_of_its_session_is_stopped_too():
+    stage, running = rig(SlowToHome)
+    description = parse_rig(RIG)
+    info = SimpleNamespace(geometry=None, device_id="S")
+    source, sink = RigSource(running, ORDER, info, Preparation(home=True), description), Ended()
+    running.enter()
+    source.start(sink)
+    assert stage.asked.wait(30.0)
+    source.stop()
+    assert sink.failures == [None]
+    assert set(stage.shop.sent) == {"stop"}
+
+
+def test_events_that_nobody_fetched_are_counted_and_told_before_the_end():
+    told = Told()
+    for count in range(1_007):
+        told.event(ClockJumped(count))
+    end = RigPassEnded("stopped", None, bench()[3].lines.report())
+    told.event(end)
+    taken = told.take(0.0)
+    assert taken[-1] is end
+    assert [event.text.split()[0] for event in taken if isinstance(event, Advice)] == ["7"]
+    assert len(taken) == 1_002
+    told.event(ClockJumped(1))
+    assert told.take(0.0) == [ClockJumped(1)]
