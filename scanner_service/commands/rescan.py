@@ -77,13 +77,10 @@ def _loop(client: httpx.Client, where: str, limits: dict[str, Any], quiet: bool)
 
 
 def _one(client: httpx.Client, where: str, number: int, turned: bool, serving: Serving) -> dict[str, Any]:
-    """Accept a pass, carry it out and wait for its end; a hand is guided meanwhile. A refused one leaves no order."""
+    """Accept a pass, carry it out and wait for its end; a hand is guided meanwhile. One refused is cancelled."""
     order = _ask(client.post(f"{where}/recommended-passes/{number}/accept", params=serving))
     mine = f"{where}/pass-orders/{order['order']}"
-    begun = client.post(f"{mine}/carry-out", json={"part_is_turned": turned})
-    if begun.is_error:
-        client.delete(mine)
-    _ask(begun)
+    _ask(client.post(f"{mine}/carry-out", json={"part_is_turned": turned}))
     by_hand = _ask(client.get(where))["source"]["kind"] == "push"
     said = ""
     while True:

@@ -125,7 +125,10 @@ class RegionBook:
         return changes
 
     def to_dict(self) -> dict[str, Any]:
-        """What a later book needs to go on with the same ids, as JSON; cubes are thinned to a few a region."""
+        """What a later book needs to go on with the same ids, as JSON; cubes are thinned to a few a region.
+
+        The surface of a shadow is kept as long as the shadow is not resolved: it has to be shown before that.
+        """
         entries = [
             {
                 "id": known_id,
@@ -133,6 +136,8 @@ class RegionBook:
                 "passes": sorted(known.passes),
                 "cubes": sorted(known.cubes)[:: max(1, len(known.cubes) // _KEPT_CUBES)],
                 "history": [moment.to_dict() for moment in known.region.history],
+                "line_spacing_mm": _number(known.region.line_spacing_mm),
+                "places_mm": known.places_mm.round(3).tolist() if known_id in self._known else [],
             }
             for known_id, known in (*self._known.items(), *self._resolved.items())
         ]
@@ -162,6 +167,7 @@ class RegionBook:
             last = history[-1]
             cubes = {(int(x), int(y), int(z)) for x, y, z in entry["cubes"]}
             reason = Reason[str(entry["reason"]).upper()]
+            spacing = entry.get("line_spacing_mm")
             region = RescanRegion(
                 number=0,
                 reason=reason,
@@ -179,8 +185,11 @@ class RegionBook:
                 region_id=int(entry["id"]),
                 status=last.status,
                 history=history,
+                line_spacing_mm=math.nan if spacing is None else float(spacing),
             )
-            known = _Known(region, cubes, frozenset(map(int, entry["passes"])))
+            known = _Known(
+                region, cubes, frozenset(map(int, entry["passes"])), _kept_places(entry.get("places_mm", ()))
+            )
             (book._resolved if last.status is RegionStatus.RESOLVED else book._known)[region.region_id] = known
         return book
 
@@ -323,6 +332,18 @@ def _places_of(region: RescanRegion) -> Float64Array:
         found += [middle + share * (0.5 * (loop + after) - middle) for share in (0.3, 0.6)]
     places = np.concatenate(found) if found else np.zeros((0, 3))
     return np.asarray(places[:: max(1, math.ceil(len(places) / _MOST_PLACES))], dtype=np.float64)
+
+
+def _kept_places(kept: Sequence[Sequence[float]]) -> Float64Array:
+    """Places as a book kept them, none where it is of a time when it kept none; raises ValueError for others."""
+    places = np.array(kept, dtype=np.float64).reshape(-1, 3)
+    if len(places) > _MOST_PLACES or not np.isfinite(places).all():
+        raise ValueError(f"a region has at most {_MOST_PLACES} places, all of them finite; {len(places)} were kept")
+    return places
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _cube_rows(points_mm: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> IntArray:

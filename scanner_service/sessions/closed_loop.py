@@ -71,10 +71,7 @@ class LoopDesk(Protocol):
         """Take an order."""
 
     def carry_out(self, order_id: int) -> PassOrder:
-        """Begin with it."""
-
-    def fail(self, order: PassOrder, why: str) -> None:
-        """Say that it could not be begun."""
+        """Begin with it; one that is refused is cancelled with the reason."""
 
     def wait_for(self, order: PassOrder) -> None:
         """Return when it is over."""
@@ -113,11 +110,7 @@ def _step(desk: LoopDesk, loop: LoopState) -> str | None:
     if loop.seconds + seconds > limits.max_seconds:
         return f"the limit of {limits.max_seconds:g} s is met"
     order = desk.accept(best.number, limits.serving)
-    try:
-        desk.carry_out(order.order_id)
-    except (SessionError, DriverError, PlanningError) as error:
-        desk.fail(order, str(error))
-        raise
+    desk.carry_out(order.order_id)
     loop.passes, loop.seconds = loop.passes + 1, loop.seconds + seconds
     desk.wait_for(order)
     return order.message if order.status is PassStatus.FAILED else None

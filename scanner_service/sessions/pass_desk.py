@@ -11,7 +11,7 @@ import numpy as np
 
 from drivers.scanline import Pose
 from scanner_service.rescan.passes.experience import chances_of, trust_of
-from scanner_service.rescan.passes.guidance import Guidance, guide
+from scanner_service.rescan.passes.guidance import Guidance, guide, reaches_end
 from scanner_service.rescan.passes.looks import Look, look_of
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.outcome import Outcome, reckon
@@ -115,6 +115,8 @@ class PassDesk:
     def carry_out(self, order_id: int, part_is_turned: bool = False) -> PassOrder:
         """Drive an accepted pass; pushed scanlines are waited for where a client or a hand moves the scanner.
 
+        A refused order is cancelled with the reason, whoever gave it; accept it again when that is mended.
+
         Parameters
         ----------
         part_is_turned : the operator says that the part lies as the pass asks.
@@ -122,27 +124,22 @@ class PassDesk:
         Raises
         ------
         PassUnknown, SessionBusy : there is no such order, or the session or the order is in another state.
-        SourceUnusable, DriverError : the pass could not be started; the order can be carried out again.
+        PlanningError : the rig cannot carry it out.
+        SourceUnusable, DriverError : the pass could not be started.
         """
         with self._lock:
             order = self._orders.get(order_id)
             if order.status is not PassStatus.ACCEPTED:
                 raise SessionBusy(f"pass order {order_id} is {order.status.value}: accept a pass of a new plan")
-            turn = order.planned.turn
-            if turn is not None and not turn.is_none and not part_is_turned:
-                raise SessionBusy(
-                    f"first {turn}; then carry the pass out and say that the part is turned (--turned, or "
-                    '"part_is_turned": true)'
-                )
-            before = self._session.fresh_results()
-            self._setup_now(before).reach.check(
-                order.planned.motion, order.planned.start_mm, order.planned.end_mm, order.planned.line_spacing_mm
-            )
-            start_pass(self._session, order.planned, self._rigs)
+            try:
+                before, setup = self._begun(order, part_is_turned)
+            except Exception as error:
+                self.cancel(order_id, str(error))
+                raise
             order.status = PassStatus.RUNNING
         self._session.event(STARTED, {"order": order.order_id})
         threading.Thread(
-            target=self._follow, args=(order, before), name=f"pass-{self._session.row.session_id}", daemon=True
+            target=self._follow, args=(order, before, setup), name=f"pass-{self._session.row.session_id}", daemon=True
         ).start()
         return order
 
@@ -203,16 +200,10 @@ class PassDesk:
         """A verdict on everything that was scanned; raises SessionError when the session is closed."""
         return self._session.fresh_results()
 
-    def fail(self, order: PassOrder, why: str) -> None:
-        """Say that an order could not be begun."""
-        order.status, order.message = PassStatus.FAILED, why
-        self._session.event(OUTCOME, outcome_event(order))
-
-    def wait_for(self, order: PassOrder, poll_s: float = 0.05) -> None:
-        """Return when an order is over."""
-        never = threading.Event()
-        while order.status is PassStatus.RUNNING:
-            never.wait(poll_s)
+    def wait_for(self, order: PassOrder) -> None:
+        """Return when a pass that is being carried out is over."""
+        if order.status is PassStatus.RUNNING:
+            order.done.wait()
 
     # -- inside -------------------------------------------------------------------------------------------------
 
@@ -221,6 +212,26 @@ class PassDesk:
             results = results or self._session.results() or self._session.fresh_results()
             self._setup = setup_of(self._session, results.snapshot, self._rigs)
         return self._setup
+
+    def _begun(self, order: PassOrder, part_is_turned: bool) -> tuple[Results, RigSetup]:
+        """Start the pass of an order; the verdict before it, and the rig that it goes with. Raises as `carry_out`."""
+        other = self._orders.running()
+        if other is not None:
+            raise SessionBusy(
+                f"pass order {other.order_id} is being carried out: wait until it is over, or stop the session, "
+                "then accept a pass of the new plan"
+            )
+        turn = order.planned.turn
+        if turn is not None and not turn.is_none and not part_is_turned:
+            raise SessionBusy(
+                f"first {turn}; then accept the pass again and carry it out, saying that the part is turned "
+                '(--turned, or "part_is_turned": true)'
+            )
+        before = self._session.fresh_results()
+        setup, planned = self._setup_now(before), order.planned
+        setup.reach.check(planned.motion, planned.start_mm, planned.end_mm, planned.line_spacing_mm)
+        start_pass(self._session, planned, self._rigs)
+        return before, setup
 
     def _planned(self, results: Results, serving: Serving) -> Plan:
         setup = self._setup_now(results)
@@ -269,8 +280,8 @@ class PassDesk:
                 _LOG.info("region %d was not marked: %s", region.region_id, error)
 
     def _outcomes(self) -> list[Outcome]:
-        """What became of the passes that were carried out, the oldest first."""
-        done = [one.outcome for one in self._orders.all() if one.status is PassStatus.DONE]
+        """What became of the passes that were carried out to their end, the oldest first."""
+        done = [one.outcome for one in self._orders.all() if one.teaches]
         return [outcome for outcome in done if outcome is not None]
 
     def _looks(self, results: Results, setup: RigSetup) -> tuple[Look, ...]:
@@ -296,12 +307,17 @@ class PassDesk:
         return tuple(look for look in found if look is not None)
 
     def _learn(self, order: PassOrder) -> None:
-        """Take in where the sensor stands after a pass, and what it was in vain for."""
-        if order.outcome is not None:
+        """Take in where the sensor stands after a pass, and what it was in vain for.
+
+        A pass that failed or was stopped was in vain for nothing, and where it ended is not known.
+        """
+        if order.teaches and order.outcome is not None:
             self._tried = self._tried.and_also(order.outcome.missed_mm)
             self._standing = order.planned.end_pose
+        elif order.status in (PassStatus.DONE, PassStatus.FAILED):
+            self._standing = None
 
-    def _follow(self, order: PassOrder, before: Results) -> None:
+    def _follow(self, order: PassOrder, before: Results, setup: RigSetup) -> None:
         """The thread of one pass: wait for its end, then say what it brought."""
         try:
             self._session.wait_until_over()
@@ -311,7 +327,9 @@ class PassDesk:
                 fresh = set(after.snapshot.lines.pass_number.tolist()) - set(before.snapshot.lines.pass_number.tolist())
                 order.map_passes = sorted(fresh)
                 order.outcome = outcome
-                self._learn(order)
+                taken = np.isin(after.snapshot.lines.pass_number, order.map_passes) & ~after.snapshot.lines.stationary
+                laser_mm = setup.optics.geometry.laser_mm
+                order.reached_end = reaches_end(order.planned, laser_mm, after.snapshot.lines.laser_mm[taken])
                 self._plan = None
                 failed = self._session.state == "failed"
                 order.message = self._session.status().message if failed else None
@@ -319,4 +337,9 @@ class PassDesk:
         except Exception as error:  # noqa: BLE001 - the thread's end: whoever waits for the order must be told
             _LOG.exception("pass order %d of session %s", order.order_id, self._session.row.session_id)
             order.message, order.status = str(error), PassStatus.FAILED
-        self._session.event(OUTCOME, outcome_event(order))
+        try:
+            with self._lock:
+                self._learn(order)
+            self._session.event(OUTCOME, outcome_event(order))
+        finally:
+            order.done.set()

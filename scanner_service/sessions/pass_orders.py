@@ -4,6 +4,7 @@ Knows the record's events as values, no session, no planner and no thread.
 """
 
 import logging
+import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -36,7 +37,9 @@ class PassStatus(StrEnum):
 class PassOrder:
     """A pass that was accepted: which one, how far it has come, and what became of it.
 
-    `map_passes` are the numbers that its scanlines have in the map, once it is done.
+    `map_passes` are the numbers that its scanlines have in the map, once it is done; `reached_end` is True when they go
+    through to the end of the pass, None when the record is of a time when this was not kept. `done` is set when a pass
+    that was carried out is over and its outcome told.
     """
 
     order_id: int
@@ -46,11 +49,19 @@ class PassOrder:
     outcome: Outcome | None = None
     message: str | None = None
     map_passes: list[int] = field(default_factory=list)
+    reached_end: bool | None = False
+    done: threading.Event = field(default_factory=threading.Event, repr=False, compare=False)
 
     @property
     def is_over(self) -> bool:
         """True when nothing more will become of it."""
         return self.status not in (PassStatus.ACCEPTED, PassStatus.RUNNING)
+
+    @property
+    def teaches(self) -> bool:
+        """True when it was carried out to its end: what it did not bring is not there to be had."""
+        went = self.reached_end if self.reached_end is not None else bool(self.map_passes)
+        return self.status is PassStatus.DONE and self.outcome is not None and went
 
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
@@ -59,6 +70,7 @@ class PassOrder:
             "version": self.version,
             "status": self.status.value,
             "message": self.message,
+            "reached_end": self.reached_end,
             "pass": self.planned.to_dict(),
             "outcome": self.outcome.to_dict() if self.outcome else None,
         }
@@ -85,6 +97,10 @@ class OrderBook:
         if not 1 <= order_id <= len(self._orders):
             raise PassUnknown(f"no pass order {order_id} was taken in this session; accept a recommended pass first")
         return self._orders[order_id - 1]
+
+    def running(self) -> PassOrder | None:
+        """The order that is being carried out; None when none is."""
+        return next((order for order in self._orders if order.status is PassStatus.RUNNING), None)
 
     def cancel(self, order_id: int, why: str) -> PassOrder:
         """Give an order up that was not started; raises PassUnknown, or SessionBusy when it is too late for that."""
@@ -124,6 +140,7 @@ class OrderBook:
             else:
                 order.status, order.message = PassStatus(details["status"]), details.get("message")
                 order.map_passes = [int(number) for number in details.get("map_passes", ())]
+                order.reached_end = bool(details["reached_end"]) if details.get("reached_end") is not None else None
                 if details.get("outcome"):
                     order.outcome = Outcome.from_dict(details["outcome"])
 

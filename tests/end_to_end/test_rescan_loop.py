@@ -36,6 +36,7 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     assert result["loop"]["why_ended"]
     first = result["orders"][0]
     assert first["status"] == "done", first["message"]
+    assert first["reached_end"] is True
     assert first["outcome"]["reached_mm2"] > 0.8 * first["outcome"]["promised_mm2"]
     assert service.status(session_id)["coverage"] > before + 0.5
     events = service.client.get(f"/api/v1/sessions/{session_id}/events?limit=1000").json()["events"]
@@ -50,7 +51,7 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     assert unclear.status_code == 409 and "reach_mm" in unclear.json()["detail"]
 
 
-def test_a_refused_pass_leaves_no_order_and_says_what_to_do(running):
+def test_a_refused_pass_is_cancelled_and_says_what_to_do(running):
     service, simulator = running.service(), running.simulator("step")
     body = {
         "name": "shadowed",
@@ -68,5 +69,11 @@ def test_a_refused_pass_leaves_no_order_and_says_what_to_do(running):
     assert refused.returncode == 1 and "--turned" in refused.stderr
     orders = service.client.get(f"/api/v1/sessions/{session_id}/pass-orders").json()["orders"]
     assert [order["status"] for order in orders] == ["cancelled"]
+    where = f"/api/v1/sessions/{session_id}"
+    order = service.client.post(f"{where}/recommended-passes/{turned['number']}/accept?reason=shadow").json()["order"]
+    begun = service.client.post(f"{where}/pass-orders/{order}/carry-out", json={"part_is_turned": False})
+    assert begun.status_code == 409 and "accept the pass again" in begun.json()["detail"]
+    told = service.client.get(f"{where}/pass-orders/{order}").json()
+    assert (told["status"], told["message"]) == ("cancelled", begun.json()["detail"])
     unknown = rescan(service, session_id, "--region", "4711")
     assert unknown.returncode == 1 and "no region 4711" in unknown.stderr

@@ -67,7 +67,10 @@ def get_order(desk: Desk, order: int) -> Response:
 
 @router.post("/pass-orders/{order}/carry-out", dependencies=[operator])
 def carry_out(desk: Desk, order: int, body: CarryOutIn) -> Response:
-    """Drive an accepted pass, or wait for the scanlines that a hand brings. The laser is switched on."""
+    """Drive an accepted pass, or wait for the scanlines that a hand brings. The laser is switched on.
+
+    An order that is refused is cancelled, with the reason as its message.
+    """
     return answer(desk.carry_out(order, body.part_is_turned).to_dict())
 
 

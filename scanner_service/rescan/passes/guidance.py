@@ -9,6 +9,7 @@ from drivers.scanline import Float64Array
 from scanner_service.rescan.passes.recommendation import RecommendedPass
 
 _NEAR_MM = 3.0
+_MOST_LINES = 0.8  # of a pass that was carried out: some are lost on the wire, and a hand is a little too fast
 _ANGLE_RAD = math.radians(8.0)
 
 
@@ -50,6 +51,21 @@ def guide(
     return Guidance(
         length - gone, aside, angle, speed_mm_per_s, fast, _say(gone, length, off, aside, angle, speed_mm_per_s, fast)
     )
+
+
+def reaches_end(wanted: RecommendedPass, laser_sensor_mm: Float64Array, laser_mm: Float64Array) -> bool:
+    """True when a pass was carried out to its end: most of its lines came, and a late one lies where it ends.
+
+    Parameters
+    ----------
+    laser_sensor_mm : (3,) the laser in the sensor frame.
+    laser_mm : (n, 3) the laser at each scanline that came, part frame, in the order of the lines.
+    """
+    if len(laser_mm) < max(1.0, _MOST_LINES * wanted.line_count):
+        return False
+    end = wanted.end_pose.apply(laser_sensor_mm)
+    late = laser_mm[len(laser_mm) // 2 :]
+    return bool((np.linalg.norm(late - end, axis=1) <= _NEAR_MM + wanted.line_spacing_mm).any())
 
 
 def _say(gone: float, length: float, off: Float64Array, aside: float, angle: float, speed: float, fast: float) -> str:

@@ -16,28 +16,31 @@ LOWERED = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """Places (n, 3) that passes were to serve and did not: each try makes the next promise smaller."""
+    """Places (n, 3) of each pass that were to be served and were not: each pass makes the next promise smaller."""
 
-    places_mm: Float64Array
+    missed_mm: tuple[Float64Array, ...] = ()
 
     def __post_init__(self) -> None:
-        read_only(self.places_mm)
+        for places_mm in self.missed_mm:
+            read_only(places_mm)
 
     @classmethod
     def nothing(cls) -> "Tried":
         """Before the first pass."""
-        return cls(np.zeros((0, 3)))
+        return cls()
 
     def and_also(self, places_mm: Float64Array) -> "Tried":
         """With the places of one more pass."""
-        return Tried(np.concatenate([self.places_mm, places_mm]))
+        return Tried((*self.missed_mm, places_mm)) if len(places_mm) else self
 
     def times(self, places_mm: Float64Array, within_mm: float) -> Float64Array:
-        """(n,) how often each place was tried."""
-        if not len(self.places_mm) or not len(places_mm):
-            return np.zeros(len(places_mm))
-        found = cKDTree(self.places_mm).query_ball_point(places_mm, within_mm, return_length=True)
-        return np.asarray(found, dtype=np.float64)
+        """(n,) how many passes missed each place, or one at most `within_mm` from it."""
+        times = np.zeros(len(places_mm))
+        if len(places_mm):
+            for missed_mm in self.missed_mm:
+                away_mm, _ = cKDTree(missed_mm).query(places_mm, distance_upper_bound=within_mm)
+                times += np.isfinite(away_mm)
+        return times
 
     def of(self, needs: Needs, cell_mm: float) -> tuple[Needs, Needs]:
         """The needs with smaller chances where passes were in vain, and those that are given up."""

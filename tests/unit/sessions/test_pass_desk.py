@@ -1,13 +1,16 @@
 """Recommended passes in a session: accepted, scanned by hand, reckoned up, and refused where they make no sense."""
 
 import dataclasses
+import threading
 import time
 
 import numpy as np
 import pytest
 
 from scanner_service.rescan.passes.errors import RigUnlimited
+from scanner_service.rescan.passes.needs import FIRST_CHANCES
 from scanner_service.rescan.passes.serving import Serving
+from scanner_service.rescan.passes.tried import TRIES
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.closed_loop import LoopLimits
@@ -76,6 +79,7 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
     session.stop()
     desk.wait_for(order)
     assert order.status is PassStatus.DONE
+    assert order.reached_end and order.teaches
     assert order.outcome.promised_mm2 == pytest.approx(one.gain_mm2)
     assert order.outcome.reached_mm2 > 0.7 * order.outcome.promised_mm2
     assert desk.plan().version > plan.version
@@ -111,12 +115,88 @@ def test_a_part_that_must_be_turned_waits_for_its_operator(book, scanned):
     order = desk.accept(turned.number)
     with pytest.raises(SessionBusy, match="part"):
         desk.carry_out(order.order_id)
+    assert order.status is PassStatus.CANCELLED and "--turned" in order.message
+    assert told(book, session, "pass_cancelled") == 1
+    order = desk.accept(turned.number)
     desk.carry_out(order.order_id, part_is_turned=True)
     assert order.status is PassStatus.RUNNING
     with pytest.raises(SessionBusy, match="running"):
         desk.carry_out(order.order_id, part_is_turned=True)
+    assert order.status is PassStatus.RUNNING  # one that runs is not cancelled by a second request
     session.stop()
     desk.wait_for(order)
+
+
+def test_one_pass_is_carried_out_at_a_time(book, scanned):
+    session, posed = scanned
+    desk = book.pass_desk(session)
+    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    first, second = desk.accept(1), desk.accept(2)
+    desk.carry_out(first.order_id)
+    push(session, posed, first.planned.motion, first.planned.start_mm, first.planned.end_mm, 1.0)
+    begun, may_judge = threading.Event(), threading.Event()
+    fresh_results = session.fresh_results
+
+    def late_verdict():
+        if threading.current_thread().name.startswith("pass-"):  # over, and not reckoned up yet
+            begun.set()
+            may_judge.wait(30)
+        return fresh_results()
+
+    session.fresh_results = late_verdict
+    session.stop()
+    assert begun.wait(30) and session.state == "stopped"
+    with pytest.raises(SessionBusy, match="pass order 1 is being carried out"):
+        desk.carry_out(second.order_id)
+    assert (first.status, second.status, session.state) == (PassStatus.RUNNING, PassStatus.CANCELLED, "stopped")
+    assert not first.done.is_set()
+    may_judge.set()
+    desk.wait_for(first)
+    assert first.done.is_set() and first.status is PassStatus.DONE
+    desk.carry_out(desk.accept(1).order_id)
+    session.stop()
+
+
+@pytest.mark.parametrize(
+    ("lines_share", "failures"), [(0.0, (None, "the scanner is gone", *[None] * (TRIES - 2))), (0.5, (None,))]
+)
+def test_a_pass_that_was_stopped_or_failed_teaches_nothing(book, scanned, tmp_path, lines_share, failures):
+    session, posed = scanned
+    desk = book.pass_desk(session)
+    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    plan = desk.plan()
+    for failure in failures:
+        order = desk.accept(1)
+        one = order.planned
+        desk.carry_out(order.order_id)
+        if lines_share:
+            end_mm = one.start_mm + lines_share * (one.end_mm - one.start_mm)
+            push(session, posed, one.motion, one.start_mm, end_mm, one.line_spacing_mm)
+        if failure is None:
+            session.stop()
+        else:
+            session.ended(failure)
+        desk.wait_for(order)
+        assert order.status is (PassStatus.DONE if failure is None else PassStatus.FAILED)
+        assert not order.reached_end and not order.teaches
+        assert len(order.outcome.missed_mm)
+    told(book, session, "pass_outcome")
+    session_id = session.row.session_id
+    again = desk.plan()
+    book.close()
+    book.record.close()
+    with Record.open(tmp_path / "record.sqlite") as record:
+        later = SessionBook(record)
+        reopened = later.pass_desk(later.get(session_id))
+        assert not any(order.teaches for order in reopened.orders())
+        reopened.describe_rig(RigSetup(free_reach(), OPTICS))
+        for now in (again, reopened.plan()):
+            assert now.passes[0].chances == FIRST_CHANCES and now.passes[0].trust == 1.0
+            assert not any("passes that should have seen it" in lost.why for lost in now.unreachable)
+            if not lines_share:  # nothing was seen: all is wanted as before, and no way is known
+                assert now.promised_mm2 == pytest.approx(plan.promised_mm2)
+                assert now.passes[0].approach_s == plan.passes[0].approach_s
+        later.close()
 
 
 def test_an_accepted_pass_can_be_cancelled_until_it_is_carried_out(book, scanned):
@@ -158,6 +238,7 @@ def test_orders_outlast_a_restart(book, scanned, tmp_path):
         first = reopened.order(1)
         assert first.outcome.reached_mm2 == pytest.approx(done.outcome.reached_mm2)
         assert first.map_passes == done.map_passes == [1]
+        assert first.reached_end and first.teaches
         assert len(first.outcome.missed_mm) == len(done.outcome.missed_mm)
         reopened.describe_rig(RigSetup(free_reach(), OPTICS))
         reopened.carry_out(accepted.order_id)  # what was accepted can still be carried out
