@@ -16,6 +16,13 @@ from scanner_service.rescan.region import RegionStatus
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionError
+from scanner_service.sessions.left_regions import (
+    REGIONS_CHANGED,
+    REGIONS_FOLLOWED,
+    LeftRegions,
+    as_in,
+    to_leave,
+)
 from scanner_service.sessions.mirror import Mirror
 from scanner_service.sessions.references import Nominal
 from scanner_service.sessions.results import Results, judge
@@ -23,9 +30,6 @@ from scanner_service.sessions.sources import Source
 from scanner_service.sessions.updates import VerdictBook
 
 T = TypeVar("T")
-REGIONS_CHANGED = "regions_changed"
-REGIONS_FOLLOWED = "regions_followed"
-"""Events: what became of regions at one verdict; and, when a scan is over, what a later opening goes on with."""
 
 WriteEvent = Callable[[str, dict[str, Any]], None]
 
@@ -54,6 +58,8 @@ class Judgement:
         self._now_s = now_s
         self._read_s = math.nan  # when the map was read that the results are of
         self._regions = RegionBook()
+        self._left: LeftRegions | None = None
+        self._is_as_left = False  # the results list the regions that were left, of the same verdict
         self._results: Results | None = None
         self._judging = threading.Lock()
         self._in_force = threading.Lock()  # of the regions and the results
@@ -73,9 +79,13 @@ class Judgement:
         with contextlib.suppress(SessionError), self._mirroring:
             self._mirror.catch_up(self._ask, self._ask_between)
 
-    def go_on_from(self, followed: RegionBook) -> None:
+    def go_on_from(self, left: LeftRegions) -> None:
         """Follow the regions that an earlier opening left; before the first verdict only."""
-        self._regions = followed
+        self._left, self._regions = left, left.book()
+
+    def compare_with(self, left: LeftRegions) -> None:
+        """List, as soon as the verdict is the same, the regions that another playing of the same lines left."""
+        self._left = left
 
     def renew(self, source: Source, unless: int | None = None) -> Results | None:
         """Judge the map as it is, seen from that source; None when the engine is gone.
@@ -104,8 +114,7 @@ class Judgement:
                 nominal.refused,
             )
             with self._in_force:
-                changes = self._regions.follow(snapshot, found.regions)
-                results = self._followed(found)
+                results, changes = self._follow(found)
             self._tell(changes)
             self._engine.ask(
                 lambda engine: self._verdicts.replace(results.verdict, snapshot.version, engine.live_map)
@@ -136,10 +145,26 @@ class Judgement:
     def write_regions_down(self) -> None:
         """Leave the regions as they are now to a later opening."""
         with self._in_force:
-            self._write_event(REGIONS_FOLLOWED, self._regions.to_dict())
+            self._write_event(REGIONS_FOLLOWED, to_leave(self._regions, self._results))
+
+    def _follow(self, found: Results) -> tuple[Results, list[Change]]:
+        """The results with their regions followed, and what has changed; of a verdict that was left, as it was left."""
+        if self._left is not None:
+            told = self._left.told_of(found)
+            if told is not None:
+                if not self._is_as_left:
+                    self._regions, self._is_as_left = self._left.book(), True
+                return self._followed(told), []
+            if self._is_as_left:  # there is more now than was left
+                self._left, self._is_as_left = None, False
+        changes = self._regions.follow(found.snapshot, found.regions)
+        return self._followed(found), changes
 
     def _followed(self, results: Results) -> Results:
         """The results, their regions with the ids, the status and the history that they have had."""
+        if self._is_as_left:
+            told = as_in(self._regions, results.regions), as_in(self._regions, results.resolved)
+            return replace(results, regions=told[0], resolved=told[1])
         return replace(results, regions=self._regions.current, resolved=self._regions.resolved)
 
     def _tell(self, changes: Sequence[Change]) -> None:

@@ -7,9 +7,8 @@ from typing import Any
 
 from scanner_service.analysis.errors import AnalysisError
 from scanner_service.analysis.passes import PassKey, pass_key
-from scanner_service.rescan.followed import RegionBook
 from scanner_service.sessions.engine import Engine, is_partial
-from scanner_service.sessions.judgement import REGIONS_FOLLOWED
+from scanner_service.sessions.left_regions import LeftRegions, last_left
 from scanner_service.sessions.withdrawals import ends_of_passes, withdrawn_passes
 from scanner_service.storage.record import Record
 
@@ -22,7 +21,7 @@ class Reopened:
     """
 
     kept: Mapping[str, Any] | None
-    regions: RegionBook
+    regions: LeftRegions | None
     damaged: tuple[str, ...]
     ended_since: bool
 
@@ -54,12 +53,8 @@ def take_in(record: Record, engine: Engine, on_progress: Callable[[int], None]) 
             damaged.append(f"line {number}: {error}")
         partial[pass_key(line)] += is_partial(line)
         on_progress(number)
-    regions = RegionBook()
-    for event in events:
-        if event.kind == REGIONS_FOLLOWED and not event.damaged:
-            regions = RegionBook.from_dict(event.details)
     for key in withdrawn_passes(events):
         engine.withdraw_pass(key)
     kept = record.ledger(session_id)
     engine.ledger.reopened(kept, record.lines_of_passes(session_id), partial)
-    return Reopened(kept, regions, tuple(damaged), bool(ends))
+    return Reopened(kept, last_left(events), tuple(damaged), bool(ends))

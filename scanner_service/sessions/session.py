@@ -27,7 +27,7 @@ from scanner_service.sessions.reopening import take_in
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.scan_clock import ScanClock
 from scanner_service.sessions.settings import SessionSettings
-from scanner_service.sessions.sources import OnAWire, Pausable, PushSource, Source, SpentSource
+from scanner_service.sessions.sources import OnAWire, Pausable, PushSource, ReplaySource, Source, SpentSource
 from scanner_service.sessions.status import Status
 from scanner_service.sessions.updates import Changes, PointPage, VerdictBook, changes_since, read_page
 from scanner_service.sessions.withdrawals import SCAN_ENDED, WITHDRAWN
@@ -84,7 +84,10 @@ class LiveSession:
         """
         warm_up()
         reopened = take_in(self._record, self.engine, on_progress)
-        self._judgement.go_on_from(reopened.regions)
+        if reopened.regions is not None:
+            self._judgement.go_on_from(reopened.regions)
+        elif isinstance(self.source, ReplaySource) and self.source.left is not None:
+            self._judgement.compare_with(self.source.left)
         if reopened.kept is not None:
             self._chronicle.kept(reopened.kept)
             self._time.go_on_from(float(reopened.kept.get("elapsed_s") or 0.0))
@@ -192,6 +195,8 @@ class LiveSession:
         self._record.append_event(self.row.session_id, WITHDRAWN, named, timeout_s=5.0).result(30.0)
         count = self.engine.ask(lambda engine: engine.withdraw_pass(key)).result()
         self._judge()
+        if self._state in ("stopped", "failed"):  # what the scan left was of the verdict before
+            self._judgement.write_regions_down()
         return count
 
     @property

@@ -14,6 +14,7 @@ from drivers.scanners.native import NativeScanner
 from scanner_service.analysis.passes import pass_key
 from scanner_service.sessions.calibration import calibration_after, geometry_from, towards_sensor_from
 from scanner_service.sessions.errors import SourceUnusable
+from scanner_service.sessions.left_regions import last_left
 from scanner_service.sessions.rig_source import Preparation, RigSource
 from scanner_service.sessions.sources import DeviceSource, PassRequest, PushSource, ReplaySource, Source
 from scanner_service.sessions.withdrawals import withdrawn_passes
@@ -187,6 +188,7 @@ class RecordSpec:
         count = self.reader.count(self.session.session_id).lines
         source = ReplaySource(lines, count, None, self.speed, let_go=self.close)
         source.geometry, source.towards_sensor = geometry_from(kept), towards_sensor_from(kept)
+        source.left = last_left(events)
         return source
 
     def to_dict(self) -> dict[str, Any]:

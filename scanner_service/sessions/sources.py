@@ -35,6 +35,7 @@ from drivers.tally import PassTally
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.errors import SourceUnusable
+from scanner_service.sessions.left_regions import LeftRegions
 from scanner_service.storage.errors import RecordError
 
 _LOG = logging.getLogger(__name__)
@@ -265,7 +266,8 @@ class ReplaySource:
     """Recorded scanlines, played as fast as they are taken or at `speed` times the pace of their device times.
 
     `accounts` is what the file held and what of it could not be used, `line_count` how many lines there are.
-    `let_go` is called, perhaps twice, when no more of them will be read. Raises SourceUnusable when `speed` is not a
+    `let_go` is called, perhaps twice, when no more of them will be read; `left` are the regions that another playing
+    of the same lines left. Raises SourceUnusable when `speed` is not a
     pace.
     """
 
@@ -282,6 +284,7 @@ class ReplaySource:
             raise SourceUnusable(f"the speed of a replay must be greater than 0, not {speed}")
         self.geometry: SensorGeometry | None = None
         self.towards_sensor: Float64Array | None = None
+        self.left: LeftRegions | None = None
         self._lines = lines
         self._line_count = line_count
         self._accounts = accounts

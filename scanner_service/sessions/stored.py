@@ -15,8 +15,8 @@ from scanner_service.rescan.followed import RegionBook
 from scanner_service.sessions.calibration import calibration_after, geometry_from, towards_sensor_from
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.fingerprint import RawHash
-from scanner_service.sessions.judgement import REGIONS_FOLLOWED
 from scanner_service.sessions.ledger import Ledger
+from scanner_service.sessions.left_regions import last_left
 from scanner_service.sessions.references import nominal_of
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.settings import SessionSettings
@@ -206,9 +206,12 @@ def read_session(
 
 
 def _followed(results: Results, events: Iterable[EventRow]) -> Results:
-    """The results, their regions with the ids and the history that the scan left in the record."""
-    kept = [event.details for event in events if event.kind == REGIONS_FOLLOWED and not event.damaged]
-    book = RegionBook.from_dict(kept[-1]) if kept else RegionBook()
+    """The results with the regions that the scan left in the record; of another verdict, followed from them."""
+    left = last_left(events)
+    told = None if left is None else left.told_of(results)
+    if told is not None:
+        return told
+    book = RegionBook() if left is None else left.book()
     book.follow(results.snapshot, results.regions)
     return replace(results, regions=book.current, resolved=book.resolved)
 
