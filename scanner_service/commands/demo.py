@@ -24,6 +24,7 @@ from scanner_service.commands.terminal import (
     console,
     errors,
     fail,
+    loss_sentence,
     plain_errors,
     regions_table,
     scan_progress,
@@ -123,6 +124,7 @@ def tell(regions: list[dict[str, Any]], summary: dict[str, Any], out: Path) -> N
         f"({summary['coverage']['gap_mm2']:,.0f} mm² of walls and shadows were never seen)",
         highlight=False,
     )
+    console.print(loss_sentence(summary["losses"]), highlight=False, soft_wrap=True)
     console.print(f"Written to {out}: {', '.join(OUTPUT_FILES)}", highlight=False, soft_wrap=True)
 
 

@@ -14,6 +14,7 @@ from scanner_service.commands.terminal import (
     check_folder,
     console,
     errors,
+    loss_sentence,
     plain_errors,
     regions_table,
     scan_progress,
@@ -135,7 +136,10 @@ def play(session: LiveSession, quiet: bool) -> None:
 
 def _facts(session: LiveSession) -> dict[str, Any]:
     status = session.status()
-    return {name: getattr(status, name) for name in ("lines", "points_per_s", "coverage", "progress", "losses")}
+    return {
+        name: getattr(status, name)
+        for name in ("lines", "points_per_s", "coverage", "coverage_kind", "progress", "losses")
+    }
 
 
 def tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
@@ -153,6 +157,7 @@ def tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
         + ("" if held is None else f"; the coverage asked for is {'reached' if held else 'not reached'}"),
         highlight=False,
     )
+    console.print(loss_sentence(summary["losses"]), highlight=False, soft_wrap=True)
     console.print(f"SHA-256 of the verdict: {summary['verdict_sha256']}", highlight=False, soft_wrap=True)
     console.print(f"Written to {out}: {', '.join(OUTPUT_FILES)}", highlight=False, soft_wrap=True)
 

@@ -5,7 +5,8 @@ import json
 import math
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn
@@ -30,6 +31,9 @@ from scanner_service.storage.formats.errors import FormatError
 console = Console(markup=False, emoji=False)
 errors = Console(stderr=True, markup=False, emoji=False)
 _MADE: ContextVar[tuple[Path, ...]] = ContextVar("folders that the command has made", default=())
+_UNWANTED = {"outside_pass", "between_stops", "before_start"}
+"""Reasons of lines that a scanner made while its stage turned or went to the next stop: no loss."""
+
 EXPECTED = (
     httpx.HTTPError,
     AnalysisError,
@@ -124,12 +128,18 @@ class ScanProgress:
     def show(self, status: Mapping[str, Any]) -> None:
         """Show a status as the API gives it."""
         coverage = status["coverage"]
-        share = "–" if coverage is None or math.isnan(coverage) else f"{coverage:.1%}"
-        facts = (
-            f"{status['lines']:,} lines  {status['points_per_s']:,.0f} points/s  coverage {share}  "
-            f"{lost_lines(status['losses']):,} lines lost"
-        )
         done = status["progress"] or 0.0
+        if coverage is None or math.isnan(coverage):
+            share = "coverage –"
+        elif status.get("coverage_kind", "observed") == "reference":
+            share = f"{coverage:.1%} of the nominal part covered"
+        else:  # while a scan is under way nobody knows of the surface that is still to come
+            share = f"{coverage:.1%} of the surface seen{' so far' if done < 1.0 else ''} covered"
+        losses = status["losses"]
+        facts = (
+            f"{status['lines']:,} lines  {status['points_per_s']:,.0f} points/s  {share}  "
+            f"{lost_lines(losses):,} lines lost, {partial_lines(losses):,} partial"
+        )
         self._bar.update(self._task, completed=done, facts=facts)
         if not self._is_terminal and not self._quiet and done >= self._printed + 0.2:
             self._printed = done
@@ -166,10 +176,44 @@ class WorkProgress:
 
 
 def lost_lines(losses: Mapping[str, Any]) -> int:
-    """Lines that were sent and are not stored: on the wire, by the device, or refused here."""
-    device = losses.get("device") or {}
-    on_the_wire = sum(device.get("lines", {}).get("lost", {}).values()) if isinstance(device.get("lines"), dict) else 0
-    return int(on_the_wire) + int(sum(losses["lines"]["refused"].values()))
+    """Lines of all passes that were sent and wanted, and are not stored: by the device, on the wire, or here."""
+    return sum(_lost(losses["passes"]).values())
+
+
+def partial_lines(losses: Mapping[str, Any]) -> int:
+    """Lines of all passes that are stored and lack a piece."""
+    return sum(int(account["lines"]["partial"]) for account in losses["passes"])
+
+
+def loss_sentence(losses: Mapping[str, Any]) -> str:
+    """What was lost in all passes, by reason, and what helps where it is known."""
+    passes = losses["passes"]
+    lost, partial = _lost(passes), partial_lines(losses)
+    chunks: Counter[str] = Counter()
+    for account in passes:
+        chunks.update((account["chunks"] or {}).get("lost", {}))
+    if not (lost or partial or chunks.total()):
+        return "No scanline was lost, and none is partial."
+    sent = sum(int(account["lines"]["sent"]) for account in passes)
+    sent_chunks = sum(int((account["chunks"] or {}).get("sent", 0)) for account in passes)
+    said = [f"of {sent:,} scanlines {partial:,} are partial", f"{lost.total():,} lost{_by_reason(lost)}"]
+    if chunks.total():
+        said.append(f"of {sent_chunks:,} chunks {chunks.total():,} were lost{_by_reason(chunks)}")
+    helps = "device_dropped" in lost or "device_dropped" in chunks
+    advice = " The scanner measured more than its wire carries: a slower pass or a lower line rate helps."
+    return f"Losses: {', '.join(said)}.{advice if helps else ''}"
+
+
+def _lost(passes: Iterable[Mapping[str, Any]]) -> "Counter[str]":
+    total: Counter[str] = Counter()
+    for account in passes:
+        total.update({reason: n for reason, n in account["lines"]["lost"].items() if n and reason not in _UNWANTED})
+    return total
+
+
+def _by_reason(lost: Mapping[str, int]) -> str:
+    told = ", ".join(f"{count:,} {reason.replace('_', ' ')}" for reason, count in sorted(lost.items()) if count)
+    return f" ({told})" if told else ""
 
 
 def regions_table(regions: list[dict[str, Any]], title: str) -> Table:

@@ -59,6 +59,11 @@ class Results:
         return self.coverage.share if self.reference is None else self.reference.share
 
     @property
+    def coverage_kind(self) -> str:
+        """`reference` where the coverage is of the nominal part, else `observed`."""
+        return "observed" if self.reference is None else "reference"
+
+    @property
     def holds(self) -> bool | None:
         """Whether the coverage asked for is reached; None when none is asked for, or none is known."""
         asked = self.requirement.coverage_share
@@ -76,7 +81,7 @@ class Results:
         """For JSON: what is asked for, what is reached, and of the nominal part what was never touched."""
         observed = self.coverage
         return {
-            "kind": "observed" if self.reference is None else "reference",
+            "kind": self.coverage_kind,
             "share": self.share,
             "required": self.requirement.coverage_share,
             "holds": self.holds,

@@ -382,6 +382,7 @@ class LiveSession:
             points=ledger.counted,
             points_per_s=ledger.counted / elapsed if elapsed > 0 else 0.0,
             coverage=results.share if results is not None else float("nan"),
+            coverage_kind=results.coverage_kind if results is not None else "observed",
             verdict_age_s=self._judgement.age_s(),
             progress=self.source.progress(),
             losses=self.losses(),

@@ -11,7 +11,8 @@ class Status:
     """What a session is doing, for people: counts, rates, losses and, when something is amiss, one sentence.
 
     `lines` and `points`: stored in the record, and counted in the map. `verdict_age_s`: how long ago the map was read
-    that regions and coverage are of, NaN before the first verdict. `held`: a pause that lasts until somebody resumes.
+    that regions and coverage are of, NaN before the first verdict. `coverage_kind`: `observed`, of the
+    surface seen, or `reference`, of the nominal part. `held`: a pause that lasts until somebody resumes.
     """
 
     session_id: str
@@ -22,6 +23,7 @@ class Status:
     points: int
     points_per_s: float
     coverage: float
+    coverage_kind: str
     verdict_age_s: float
     progress: float | None
     losses: dict[str, Any]

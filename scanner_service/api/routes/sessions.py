@@ -107,6 +107,7 @@ def status_answer(session: LiveSession) -> dict[str, Any]:
         "points": status.points,
         "points_per_s": status.points_per_s,
         "coverage": status.coverage,
+        "coverage_kind": status.coverage_kind,
         "verdict_age_s": status.verdict_age_s,
         "progress": status.progress,
         "losses": status.losses,

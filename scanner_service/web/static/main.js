@@ -111,7 +111,7 @@ function regions() {
   const list = session.regions ?? [];
   overlay.show(list, session.origin, view.radius);
   overlay.choose(chosenRegion);
-  drawRegions(byId("regions"), byId("regions-count"), session.regions, chosenRegion, chooseRegion);
+  drawRegions(byId("regions"), byId("regions-count"), session.regions, chosenRegion, chooseRegion, session.status);
   legend();
   view.invalidate();
 }
@@ -231,7 +231,7 @@ function chooseRegion(number) {
   if (!region) return;
   chosenRegion = number;
   overlay.choose(number);
-  drawRegions(byId("regions"), byId("regions-count"), session.regions, chosenRegion, chooseRegion);
+  drawRegions(byId("regions"), byId("regions-count"), session.regions, chosenRegion, chooseRegion, session.status);
   byId("regions").querySelector("[aria-pressed=true]")?.scrollIntoView({ block: "nearest" });
   const local = (point) => point.map((value, axis) => value - session.origin[axis]);
   const corners = [region.centroid_mm, ...(region.outline_mm ?? []).flat()].map(local);
@@ -249,7 +249,7 @@ function clear() {
   inspect(-1);
   chosenRegion = null;
   overlay.choose(null);
-  drawRegions(byId("regions"), byId("regions-count"), session.regions, null, chooseRegion);
+  drawRegions(byId("regions"), byId("regions-count"), session.regions, null, chooseRegion, session.status);
 }
 
 function rowUnder(event) {

@@ -8,13 +8,23 @@ import { reasonByKey, RESCAN_REASONS, rescanReason, STATE_ISOLATED, STATE_NOT_CO
 
 const figure = (name, value, unit = null) => element("div", {}, element("dt", {}, name), element("dd", {}, value, unit === null ? null : element("span.unit", {}, unit)));
 
+const UNDER_WAY = new Set(["scanning", "paused"]);
+
+// Nobody knows of the surface that a scan has still to come to, unless there is a nominal part.
+export function coverageName(status) {
+  if (status?.coverage_kind === "reference") return "Coverage of the nominal part";
+  return UNDER_WAY.has(status?.state) ? "Coverage of the surface seen so far" : "Observed coverage";
+}
+
+export const noRegions = (status) => (UNDER_WAY.has(status?.state) ? "No region of the surface seen so far needs another scan." : "No region needs another scan.");
+
 export function drawFigures(place, status, store, box) {
   const size = box ? box.high.map((high, axis) => significant(high - box.low[axis])).join(" × ") : "–";
   place.replaceChildren(
     figure("Lines", whole(status?.lines)),
     figure("Points", whole(status?.points ?? (store.total || null))),
     figure("Rate", whole(status?.points_per_s), missing(status?.points_per_s) ? null : "points/s"),
-    figure("Observed coverage", percent(status?.coverage)),
+    figure(coverageName(status), percent(status?.coverage)),
     status?.state === "scanning" && !missing(status.verdict_age_s) ? figure("Verdict", whole(status.verdict_age_s), "s old") : "",
     figure("Extent x × y × z", size, box ? "mm" : null),
     store.skipped > 0 ? figure("Updates merged", whole(store.skipped)) : "",
@@ -39,10 +49,10 @@ export function drawLosses(place, count, losses) {
   place.replaceChildren(...(losses ? accounts(losses).map(tally) : [element("p.empty", {}, "Not known yet.")]));
 }
 
-export function drawRegions(place, count, regions, chosen, onChoose) {
+export function drawRegions(place, count, regions, chosen, onChoose, status = null) {
   count.textContent = regions === null ? "" : whole(regions.length);
   if (!regions?.length) {
-    place.replaceChildren(element("li.empty", {}, regions === null ? "Not known yet." : "No region needs another scan."));
+    place.replaceChildren(element("li.empty", {}, regions === null ? "Not known yet." : noRegions(status)));
     return;
   }
   const item = (region, said) => {

@@ -5,7 +5,7 @@ import typer
 from typer.testing import CliRunner
 
 from scanner_service.cli import app
-from scanner_service.commands.terminal import errors, fail
+from scanner_service.commands.terminal import errors, fail, loss_sentence, scan_progress
 from scanner_service.storage.record import Record
 
 
@@ -23,3 +23,50 @@ def test_an_option_that_a_record_would_ignore_is_refused(tmp_path):
     )
     assert run.exit_code == 1
     assert "--density, --noise" in run.output
+
+
+def _losses():
+    """Of two passes: one whose rate overran the wire, one of a rig that measured before the stage set off as well."""
+
+    def account(sent, partial, lost, chunks):
+        stored = sent - sum(lost.values())
+        lines = {"sent": sent, "stored": stored, "whole": stored - partial, "partial": partial, "under_way": 0,
+                 "duplicates": 0, "lost": lost}  # fmt: skip
+        return {"device_id": "A", "boot_id": 1, "pass_index": 0, "lines": lines, "chunks": chunks}
+
+    overrun = {"sent": 1608, "stored": 1200, "lost": {"device_dropped": 408}}
+    return {
+        "passes": [
+            account(201, 79, {}, overrun),
+            account(100, 0, {"disconnected": 2, "refused_invalid": 1, "before_start": 30}, None),
+        ]
+    }
+
+
+def test_a_scan_that_lost_something_says_what_and_why_at_its_end():
+    said = loss_sentence(_losses())
+    assert "of 301 scanlines 79 are partial, 3 lost (2 disconnected, 1 refused invalid)" in said
+    assert "of 1,608 chunks 408 were lost (408 device dropped)" in said
+    assert "before start" not in said  # not wanted, and no loss
+    assert "lower line rate" in said
+    whole = {"passes": [account | {"chunks": None, "lines": account["lines"] | {"partial": 0, "lost": {}}}
+                        for account in _losses()["passes"]]}  # fmt: skip
+    assert loss_sentence(whole) == "No scanline was lost, and none is partial."
+
+
+@pytest.mark.parametrize(
+    ("kind", "progress", "coverage", "said"),
+    [
+        ("observed", 0.22, 1.0, "100.0% of the surface seen so far covered"),
+        ("observed", 1.0, 0.5, "50.0% of the surface seen covered"),
+        ("reference", 0.22, 0.2, "20.0% of the nominal part covered"),
+        ("observed", 0.01, None, "coverage –"),
+    ],
+)
+def test_progress_says_what_the_coverage_is_of_and_counts_partial_lines(kind, progress, coverage, said):
+    status = {"lines": 201, "points_per_s": 9.0, "coverage": coverage, "coverage_kind": kind, "progress": progress}
+    with errors.capture() as told, scan_progress("scanning") as bar:
+        bar.show(status | {"losses": _losses()})
+    text = " ".join(told.get().split())
+    assert said in text
+    assert "3 lines lost, 79 partial" in text

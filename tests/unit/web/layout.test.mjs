@@ -5,6 +5,7 @@ import { test } from "node:test";
 
 const { fitInto } = await import("../../../scanner_service/web/static/fitting.js");
 const { roomFor } = await import("../../../scanner_service/web/static/label_places.js");
+const { coverageName, noRegions } = await import("../../../scanner_service/web/static/panels.js");
 const { accounts, headline } = await import("../../../scanner_service/web/static/loss_ledger.js");
 
 // a small linear congruential generator: the same draws on every machine
@@ -102,4 +103,13 @@ test("every pass is told as one balance, and boots are named only where there ar
   const many = accounts({ passes: Array.from({ length: 40 }, (_, index) => pass(7 + (index % 2), index)) });
   assert.equal(many.at(-1).title, "Pass 39 of S1, boot 8");
   assert.ok(many.length <= 12);
+});
+
+test("while a scan is under way coverage and regions are said to be of what was seen so far", () => {
+  assert.equal(coverageName({ state: "scanning", coverage_kind: "observed" }), "Coverage of the surface seen so far");
+  assert.equal(coverageName({ state: "stopped", coverage_kind: "observed" }), "Observed coverage");
+  assert.equal(coverageName({ state: "scanning", coverage_kind: "reference" }), "Coverage of the nominal part");
+  assert.equal(noRegions({ state: "scanning" }), "No region of the surface seen so far needs another scan.");
+  assert.equal(noRegions({ state: "stopped" }), "No region needs another scan.");
+  assert.equal(coverageName(null), "Observed coverage");
 });
