@@ -108,7 +108,7 @@ def _mark(region: RescanRegion) -> tuple[object, ...]:
 
 
 def _kept(region: RescanRegion) -> dict[str, object]:
-    return {name: value for name, value in region.to_dict().items() if name not in ("number", "status", "history")}
+    return {name: value for name, value in region.to_dict().items() if name not in ("status", "history")}
 
 
 def _read(kept: Mapping[str, Any]) -> RescanRegion:
@@ -118,7 +118,7 @@ def _read(kept: Mapping[str, Any]) -> RescanRegion:
         return float("nan") if kept[name] is None else float(kept[name])
 
     return RescanRegion(
-        number=0,
+        number=int(kept["number"]),
         reason=Reason[str(kept["reason"]).upper()],
         outline_mm=tuple(np.array(loop, dtype=np.float64).reshape(-1, 3) for loop in kept["outline_mm"]),
         area_mm2=float(kept["area_mm2"]),

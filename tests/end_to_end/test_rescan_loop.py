@@ -15,7 +15,7 @@ def rescan(service, session_id, *arguments):
     )  # fmt: skip
 
 
-def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(running):
+def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(running, tmp_path):
     service, simulator = running.service(), running.simulator()
     body = {
         "name": "coarse",
@@ -43,6 +43,16 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     told = [event["kind"] for event in events]
     assert told.index("pass_accepted") < told.index("pass_started") < told.index("pass_outcome")
     assert told[-1] == "loop_ended"
+    listed = service.client.get(f"/api/v1/sessions/{session_id}/regions").json()
+    exported = subprocess.run(
+        [sys.executable, "-m", "scanner_service", "export", session_id, "--data", str(service.data),
+         "--format", "results", "--out", str(tmp_path)],
+        capture_output=True, text=True, cwd=ROOT, timeout=110, check=False,
+    )  # fmt: skip
+    assert exported.returncode == 0, exported.stderr
+    written = json.loads(next(tmp_path.rglob("regions.json")).read_text())
+    for name in ("regions", "resolved"):
+        assert written[name] == listed[name]
     refused = service.client.post(f"/api/v1/sessions/{session_id}/recommended-passes/99/accept")
     assert (refused.status_code, refused.headers["content-type"]) == (404, "application/problem+json")
     unclear = service.client.put(f"/api/v1/sessions/{session_id}/rig", json={
