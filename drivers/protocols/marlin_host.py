@@ -11,7 +11,6 @@ from collections.abc import Callable
 from drivers.errors import StageAlarm, StageRefused
 from drivers.protocols.marlin import (
     Busy,
-    Capability,
     Done,
     Firmware,
     Position,
@@ -52,7 +51,6 @@ class MarlinHost(StageHost):
         self._letter = letter
         self._given_steps = self._steps_per_unit = steps_per_unit
         self._zero = math.nan  # position = zero + count / steps per unit
-        self._stops_at_once = False
         self._sent = SentLines()
         self._waiting: deque[str] = deque()
         self._under_way: str | None = None
@@ -62,11 +60,6 @@ class MarlinHost(StageHost):
         self._position: Position | None = None
         self._draining = False
         self._restless = 0
-
-    @property
-    def stops_at_once(self) -> bool:
-        """True when the firmware hears a stop while it is busy with another command (EMERGENCY_PARSER)."""
-        return self._stops_at_once
 
     # ---- greeting ---------------------------------------------------------------------------------------------------
 
@@ -142,8 +135,6 @@ class MarlinHost(StageHost):
                     self._steps_per_unit = abs(per_unit.get(self._letter, 0.0))
             case Firmware(name=name):
                 self.identity = name
-            case Capability(name="EMERGENCY_PARSER", is_there=is_there):
-                self._stops_at_once = is_there
             case Remark():
                 self.strays += 1
 

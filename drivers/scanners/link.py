@@ -1,7 +1,7 @@
-"""A port, the one thread that reads it, and the bounded queue behind it; knows no protocol and decides no policy.
+"""A scanner's port with its thread, and the bounded queue behind it; knows no protocol and decides no policy.
 
-The thread reads, stamps and hands the bytes to the host's half of a conversation, writes what that has to say, and
-opens a lost port again. It never waits for whoever fetches the lines.
+The thread stamps what it reads and hands it to the host's half of a conversation, and writes what that has to say. It
+never waits for whoever fetches the lines.
 """
 
 import threading
@@ -10,16 +10,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple, Protocol
 
-from drivers.errors import PortError, PortStalled
+from drivers.errors import PortStalled
 from drivers.port import LEAVE_LINES, ModemLines, Port, lasting_path
+from drivers.port_thread import PortThread
 from drivers.protocols.scanner_events import ScannerEvent
 from drivers.scanline import Profile
 from drivers.scanners.face import Happening
 from drivers.tally import Tally
 
-_READ_S = 0.02
-_REOPEN_S = 0.1
-_STALL_S = 1.0
 _OVERRUNS_S = 1.0
 _MAX_EVENTS = 1_000
 
@@ -93,7 +91,7 @@ class Inbox:
         return happenings
 
 
-class Link:
+class Link(PortThread):
     """The port at `path` while it is entered, over all its pullings-out.
 
     `changed` guards the host and the inbox, and is notified whenever something may have come. `wire` tells how the port
@@ -113,57 +111,22 @@ class Link:
         wire: Callable[[], Wire],
         lines: ModemLines = LEAVE_LINES,
     ) -> None:
+        super().__init__(changed, clock)
         self._path = path
         self._host = host
-        self._changed = changed
-        self._clock = clock
         self._wire = wire
         self._lines = lines
-        self.failure: Exception | None = None
         self.overruns = 0
         """Bytes that UART and kernel dropped, where they count them."""
         self._overruns_before = 0
         self._overruns_s = clock()
-        self._stalled_s: float | None = None
-        self._closing = threading.Event()
         port = Port(path, wire().baud_rate, lines)
         self._reopen_path = lasting_path(path)
-        with changed:
-            host.link_opened(clock())
-        self._thread = threading.Thread(target=self._run, args=(port,), name=f"scanner {path}", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """End the thread, which closes the port."""
-        self._closing.set()
-        self._thread.join()
+        self._begin(port, f"scanner {path}")
 
     def with_overruns(self, tally: Tally) -> Tally:
         """The accounts, with the bytes that nobody read in time among the damage."""
         return replace(tally, damage=tally.damage | {"uart_overrun": self.overruns}) if self.overruns else tally
-
-    def _run(self, port: Port | None) -> None:
-        try:
-            while not self._closing.is_set():
-                try:
-                    if port is None:
-                        port = self._reopen()
-                        continue
-                    data = port.read(_READ_S)
-                    self._talk(port, data)
-                except PortError as error:
-                    if port is not None:
-                        port.close()
-                    port = None
-                    if not self._survives(error):
-                        return
-        except Exception as failure:  # noqa: BLE001 - the thread's loop: whoever waits must be told
-            with self._changed:
-                self.failure = failure
-                self._changed.notify_all()
-        finally:
-            if port is not None:
-                port.close()
 
     def _talk(self, port: Port, data: bytes) -> None:
         """Take what was read, set the port as the host wants it, send what is due."""
@@ -179,7 +142,7 @@ class Link:
             if host.outgoing:
                 written = port.write(bytes(host.outgoing))
                 del host.outgoing[:written]
-                self._watch_stall(written, now_s)
+                self._watch_stall(self._path, written, now_s)
             if now_s - self._overruns_s >= _OVERRUNS_S:
                 self._overruns_s = now_s
                 self.overruns = self._overruns_before + (port.overruns() or 0)
@@ -191,36 +154,18 @@ class Link:
         if wire.dtr is not None:
             port.set_dtr(wire.dtr)
 
-    def _watch_stall(self, written: int, now_s: float) -> None:
-        if written:
-            self._stalled_s = None
-        elif self._stalled_s is None:
-            self._stalled_s = now_s
-        elif now_s - self._stalled_s > _STALL_S:
-            raise PortStalled(self._path, f"{self._path} takes no more bytes; check cable and power")
+    def _opened(self, now_s: float) -> None:
+        self._host.link_opened(now_s)
 
-    def _survives(self, error: PortError) -> bool:
-        """Tell of a lost link; True when it is worth waiting for, False when the device was never met."""
-        with self._changed:
-            self._stalled_s = None
-            self._overruns_before = self.overruns
-            met = self._host.is_met
-            self._host.link_lost(str(error), self._clock())
-            if not met:
-                self.failure = error
-            self._changed.notify_all()
+    def _lost(self, reason: str, now_s: float) -> bool:
+        """Worth waiting for unless the device was never met."""
+        self._overruns_before = self.overruns
+        met = self._host.is_met
+        self._host.link_lost(reason, now_s)
         return met
 
-    def _reopen(self) -> Port | None:
-        """Wait a little and try the path once."""
-        self._closing.wait(_REOPEN_S)
-        try:
-            port = Port(self._reopen_path, self._wire().baud_rate, self._lines)
-        except PortError:
-            with self._changed:
-                self._host.tick(self._clock())
-                self._changed.notify_all()
-            return None
-        with self._changed:
-            self._host.link_opened(self._clock())
-        return port
+    def _open_again(self) -> Port:
+        return Port(self._reopen_path, self._wire().baud_rate, self._lines)
+
+    def _still_gone(self, now_s: float) -> None:
+        self._host.tick(now_s)

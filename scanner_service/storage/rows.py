@@ -69,11 +69,6 @@ class Watermark:
     first_index: int
     line_count: int
 
-    @property
-    def contiguous(self) -> bool:
-        """True when no index between the first and the highest is missing."""
-        return self.line_count == self.line_index - self.first_index + 1
-
 
 @dataclass(frozen=True, slots=True)
 class Count:

@@ -117,6 +117,25 @@ def weight_of(weighting: int, square: float, per_square: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def plane_of_sums(
+    w: float, w2: float, x: float, y: float, z: float, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
+) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
+    """Axis, moments and effective count of weighted sums over a neighbourhood; zeros where nothing weighs anything."""
+    if w == 0.0:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
+    per = 1.0 / w
+    nx, ny, nz, a, b, c = smallest_axis(
+        xx - x * x * per,
+        xy - x * y * per,
+        xz - x * z * per,
+        yy - y * y * per,
+        yz - y * z * per,
+        zz - z * z * per,
+    )
+    return (nx, ny, nz), (a, b, c), w * w / w2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fit(
     points: Float64Array,
     at: Int64Array,
@@ -140,18 +159,4 @@ def _fit(
             x, y, z = x + g * dx, y + g * dy, z + g * dz
             xx, xy, xz = xx + g * dx * dx, xy + g * dx * dy, xz + g * dx * dz
             yy, yz, zz = yy + g * dy * dy, yz + g * dy * dz, zz + g * dz * dz
-        if w == 0.0:
-            axes[i, :], moments[i, :], effective[i] = 0.0, 0.0, 0.0
-            continue
-        per = 1.0 / w
-        nx, ny, nz, a, b, c = smallest_axis(
-            xx - x * x * per,
-            xy - x * y * per,
-            xz - x * z * per,
-            yy - y * y * per,
-            yz - y * z * per,
-            zz - z * z * per,
-        )
-        axes[i, 0], axes[i, 1], axes[i, 2] = nx, ny, nz
-        moments[i, 0], moments[i, 1], moments[i, 2] = a, b, c
-        effective[i] = w * w / w2
+        axes[i], moments[i], effective[i] = plane_of_sums(w, w2, x, y, z, xx, xy, xz, yy, yz, zz)

@@ -8,9 +8,8 @@ from drivers.scanline import Float64Array
 from scanner_service.analysis.graphs.kd_tree import Int32Array, KdTree, box_distance_sq, build_kd_tree, node_start
 from scanner_service.analysis.graphs.slices import in_slices
 from scanner_service.analysis.normals.field import Int64Array, NormalField, NormalOptions, Tell
-from scanner_service.analysis.normals.fitting import Weighting, judge_planes, per_square_of, weight_of
+from scanner_service.analysis.normals.fitting import Weighting, judge_planes, per_square_of, plane_of_sums, weight_of
 from scanner_service.analysis.normals.neighbourhoods import PROBE, refuse_crowds
-from scanner_service.analysis.plane import smallest_axis
 
 
 def fit_within(
@@ -166,18 +165,4 @@ def _fit(
                 xx, xy, xz = xx + g * dx * dx, xy + g * dx * dy, xz + g * dx * dz
                 yy, yz, zz = yy + g * dy * dy, yz + g * dy * dz, zz + g * dz * dz
         count[i] = within
-        if w == 0.0:
-            axes[i, :], moments[i, :], effective[i] = 0.0, 0.0, 0.0
-            continue
-        per = 1.0 / w
-        nx, ny, nz, a, b, c = smallest_axis(
-            xx - x * x * per,
-            xy - x * y * per,
-            xz - x * z * per,
-            yy - y * y * per,
-            yz - y * z * per,
-            zz - z * z * per,
-        )
-        axes[i, 0], axes[i, 1], axes[i, 2] = nx, ny, nz
-        moments[i, 0], moments[i, 1], moments[i, 2] = a, b, c
-        effective[i] = w * w / w2
+        axes[i], moments[i], effective[i] = plane_of_sums(w, w2, x, y, z, xx, xy, xz, yy, yz, zz)
