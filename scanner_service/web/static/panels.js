@@ -13,7 +13,7 @@ const UNDER_WAY = new Set(["scanning", "paused"]);
 // Nobody knows of the surface that a scan has still to come to, unless there is a nominal part.
 export function coverageName(status) {
   if (status?.coverage_kind === "reference") return "Coverage of the nominal part";
-  return UNDER_WAY.has(status?.state) ? "Coverage of the surface seen so far" : "Observed coverage";
+  return UNDER_WAY.has(status?.state) ? "Coverage so far" : "Observed coverage";
 }
 
 export const noRegions = (status) => (UNDER_WAY.has(status?.state) ? "No region of the surface seen so far needs another scan." : "No region needs another scan.");
@@ -25,8 +25,8 @@ export function drawFigures(place, status, store, box) {
     figure("Points", whole(status?.points ?? (store.total || null))),
     figure("Rate", whole(status?.points_per_s), missing(status?.points_per_s) ? null : "points/s"),
     figure(coverageName(status), percent(status?.coverage)),
-    status?.state === "scanning" && !missing(status.verdict_age_s) ? figure("Verdict", whole(status.verdict_age_s), "s old") : "",
     figure("Extent x × y × z", size, box ? "mm" : null),
+    status?.state === "scanning" && !missing(status.verdict_age_s) ? figure("Verdict", whole(status.verdict_age_s), "s old") : "",
     store.skipped > 0 ? figure("Updates merged", whole(store.skipped)) : "",
   );
 }

@@ -106,7 +106,7 @@ test("every pass is told as one balance, and boots are named only where there ar
 });
 
 test("while a scan is under way coverage and regions are said to be of what was seen so far", () => {
-  assert.equal(coverageName({ state: "scanning", coverage_kind: "observed" }), "Coverage of the surface seen so far");
+  assert.equal(coverageName({ state: "scanning", coverage_kind: "observed" }), "Coverage so far");
   assert.equal(coverageName({ state: "stopped", coverage_kind: "observed" }), "Observed coverage");
   assert.equal(coverageName({ state: "scanning", coverage_kind: "reference" }), "Coverage of the nominal part");
   assert.equal(noRegions({ state: "scanning" }), "No region of the surface seen so far needs another scan.");
