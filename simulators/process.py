@@ -34,6 +34,8 @@ STAGE_MM = (-100.0, 400.0)
 BUFFER_BYTES = 262_144
 """Larger than a real scanner's: the simulator shares a computer with its client, and a pause of the computer of up to
 0.8 s at the default rate must not look like a slow wire."""
+PATIENT_DEAD_MAN_S = 5.0
+"""Longer than a real scanner's, for the same reason: no laser is on, and a busy computer is no host that is gone."""
 _LOOK_S = 0.1
 
 Event = dict[str, object]
@@ -70,6 +72,7 @@ def simulated_device(
     device_id: str = "SIM-0001",
     boot_id: int | None = None,
     part_from_sensor: Pose | None = None,
+    dead_man_s: float = PATIENT_DEAD_MAN_S,
 ) -> NativeDevice:
     """A scanner over `part` that speaks the native protocol.
 
@@ -88,7 +91,9 @@ def simulated_device(
         geometry=optics.geometry(),
     )
     scene = Scene(optics, part, scene_rng, part_from_sensor)
-    return NativeDevice(info, scene, rng=device_rng, travel_mm=STAGE_MM, buffer_bytes=BUFFER_BYTES)
+    return NativeDevice(
+        info, scene, rng=device_rng, travel_mm=STAGE_MM, buffer_bytes=BUFFER_BYTES, dead_man_s=dead_man_s
+    )
 
 
 def serve_simulated_scanner(
@@ -104,6 +109,7 @@ def serve_simulated_scanner(
     faults: Faults | None = None,
     device_id: str = "SIM-0001",
     boot_id: int | None = None,
+    dead_man_s: float = PATIENT_DEAD_MAN_S,
     commands: int | None = None,
 ) -> None:
     """Serve a simulated scanner in the calling thread until `stop` is set, or until `commands` ends or says so.
@@ -117,6 +123,7 @@ def serve_simulated_scanner(
     baud_rate : of the wire where the device does not set it itself: `native`.
     seed : of the noise, the dropouts and the faults.
     link_path : a symbolic link that always names the present terminal.
+    dead_man_s : how long the native device scans on without a word of its host.
     commands : a file descriptor with one command a line; None: there are none.
 
     Raises
@@ -128,7 +135,7 @@ def serve_simulated_scanner(
     extras: Event = {"travel_mm": list(part.travel_mm), "part": part.description, "seed": seed}
     if kind == "native":
         native_rate = DEFAULT_BAUD_RATE if baud_rate is None else baud_rate
-        native = simulated_device(part, scene_rng, device_id=device_id, boot_id=boot_id)
+        native = simulated_device(part, scene_rng, device_id=device_id, boot_id=boot_id, dead_man_s=dead_man_s)
         port = PtyPort(native, native_rate, faults, link_path=link_path, rng=wire_rng)
         actions["reboot"] = lambda: port.in_loop(native.reboot)
         extras["baud_rate"] = native_rate
@@ -206,6 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             faults=_faults(given),
             device_id=given.device_id,
             boot_id=given.boot_id,
+            dead_man_s=given.dead_man,
             commands=_piped_input(),
         )
     except (SimulatedPortError, MeshError, ValueError) as error:
@@ -235,6 +243,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=1, help="of noise, dropouts and faults")
     parser.add_argument("--device-id", default="SIM-0001", help="the scanner's serial number")
     parser.add_argument("--boot-id", type=int, help="drawn anew when not given")
+    parser.add_argument(
+        "--dead-man", type=float, default=PATIENT_DEAD_MAN_S, help="seconds that the native scanner goes on unasked"
+    )
     for item in fields(Faults):
         if item.name.endswith("_rate"):
             parser.add_argument("--" + item.name.replace("_", "-"), type=float, default=0.0, metavar="CHANCE")

@@ -44,7 +44,7 @@ class Ledger:
     left_out: Counter[str] = field(default_factory=Counter)
     _fates: dict[PassKey, LineFates] = field(default_factory=dict)
     _earlier: dict[PassKey, PassAccount] = field(default_factory=dict)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _lock: threading.Condition = field(default_factory=threading.Condition)
 
     def arrived(self, key: PassKey) -> None:
         """A line of a pass came in and waits for its fate."""
@@ -74,6 +74,13 @@ class Ledger:
                     self.conflicts += 1
                 else:
                     self.refused[outcome] += 1
+            if self.pending == 0:
+                self._lock.notify_all()
+
+    def wait_until_decided(self, timeout_s: float) -> bool:
+        """Wait until every line that came in has its fate; False when not after `timeout_s`."""
+        with self._lock:
+            return self._lock.wait_for(lambda: self.pending == 0, timeout_s)
 
     def reopened(
         self, kept: Mapping[str, Any] | None, stored: Mapping[PassKey, int], partial: Mapping[PassKey, int]

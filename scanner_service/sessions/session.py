@@ -36,6 +36,7 @@ from scanner_service.storage.rows import EventRow, SessionRow, Stored
 
 _LOG = logging.getLogger(__name__)
 ANALYSIS_PERIOD_S = 1.0
+_COMMIT_PATIENCE_S = 10.0
 """The map is read about this often during a scan; regions are looked for as often as `Cadence` allows."""
 
 
@@ -411,6 +412,8 @@ class LiveSession:
             except SessionError as error:
                 failure = failure or str(error)
             self._time.stop()
+            # The account of a scan that is over is whole: the last commits are waited for, while there are any.
+            self.engine.ledger.wait_until_decided(0.0 if self._record.is_failing else _COMMIT_PATIENCE_S)
             self._held = False
             self._judge()
             self._chronicle.event(SCAN_ENDED, self.losses(), patience_s=5.0)

@@ -12,7 +12,7 @@ from pathlib import Path
 import httpx
 
 ROOT = Path(__file__).resolve().parents[2]
-PATIENCE_S = 60.0
+PATIENCE_S = 300.0
 
 
 class RunningService:
@@ -30,7 +30,9 @@ class RunningService:
         where = json.loads(announced)
         self.url, self.viewer = where["url"], where["viewer"]
         self.key = (data / "local-key").read_text().strip()
-        self.client = httpx.Client(base_url=self.url, headers={"Authorization": f"Bearer {self.key}"}, timeout=60.0)
+        self.client = httpx.Client(
+            base_url=self.url, headers={"Authorization": f"Bearer {self.key}"}, timeout=PATIENCE_S
+        )
         wait_for(lambda: self.client.get("/readyz").status_code == 200, "the service to be ready")
 
     def kill(self):
@@ -70,7 +72,8 @@ class RunningSimulator:
     """`python -m simulators` in a process of its own; commands go in, announcements come out."""
 
     def __init__(self, part="plate", *arguments):
-        command = [sys.executable, "-m", "simulators", "--part", part, *map(str, arguments)]
+        patient = ["--dead-man", "60"]  # a busy machine is no host that is gone; a later argument says otherwise
+        command = [sys.executable, "-m", "simulators", "--part", part, *patient, *map(str, arguments)]
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=os.environ
         )
@@ -89,10 +92,10 @@ class RunningSimulator:
         self.process.stdout.close()
 
 
-def wait_for(condition, what):
-    """Poll until the condition holds; fails with a sentence when it never does."""
+def wait_for(condition, what, seen=lambda: "nothing"):
+    """Poll until the condition holds; fails with a sentence, and with what was seen last, when it never does."""
     deadline_s = time.monotonic() + PATIENCE_S
     while not condition():
         if time.monotonic() > deadline_s:
-            raise AssertionError(f"waited {PATIENCE_S:g} s for {what}")
+            raise AssertionError(f"waited {PATIENCE_S:g} s for {what}; last seen: {seen()}")
         time.sleep(0.05)

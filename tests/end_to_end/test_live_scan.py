@@ -65,7 +65,7 @@ class LiveClient:
                 assert until(self), "the service said that everything was sent"
             return until(self)
 
-        wait_for(step, "the live stream")
+        wait_for(step, "the live stream", seen=lambda: (self.status, self.credit, len(self.points), self.version))
 
     def _hear(self):
         if self.credit == 0:
@@ -100,8 +100,8 @@ class LiveClient:
         self.version = version
 
 
-def test_a_plate_is_scanned_streamed_and_found_good(running):
-    service, simulator = running.service(), running.simulator("plate")
+def test_a_plate_is_scanned_streamed_and_found_good(service, running):
+    simulator = running.simulator("plate")
     session_id = service.create(**device(simulator))
     with live_client(service, session_id) as client:
         service.start(session_id)
@@ -133,8 +133,8 @@ def test_a_plate_is_scanned_streamed_and_found_good(running):
     assert picture.content.startswith(b"\x89PNG")
 
 
-def test_a_step_throws_a_shadow_that_becomes_a_region(running):
-    service, simulator = running.service(), running.simulator("step")
+def test_a_step_throws_a_shadow_that_becomes_a_region(service, running):
+    simulator = running.simulator("step")
     session_id = service.create(**device(simulator, end_mm=simulator.ready["travel_mm"][1]))
     service.start(session_id)
     service.wait_for_state(session_id, "stopped")
@@ -145,8 +145,7 @@ def test_a_step_throws_a_shadow_that_becomes_a_region(running):
     assert page["next"] == 15
 
 
-def test_damage_on_the_wire_is_counted_and_balances(running):
-    service = running.service()
+def test_damage_on_the_wire_is_counted_and_balances(service, running):
     simulator = running.simulator("plate", "--bit-error-rate", "2e-6", "--byte-loss-rate", "2e-6", "--seed", 3)
     session_id = service.create(**device(simulator))
     service.start(session_id)
@@ -160,8 +159,7 @@ def test_damage_on_the_wire_is_counted_and_balances(running):
     assert status["losses"]["points"]["dropped"]["missing"] > 0
 
 
-def test_a_pulled_cable_pauses_the_scan_and_its_return_resumes_it(running, tmp_path):
-    service = running.service()
+def test_a_pulled_cable_pauses_the_scan_and_its_return_resumes_it(service, running, tmp_path):
     link = tmp_path / "scanner-port"
     simulator = running.simulator("plate", "--link", link)
     session_id = service.create(**device(simulator, port=str(link), rearm=True))
@@ -180,8 +178,8 @@ def test_a_pulled_cable_pauses_the_scan_and_its_return_resumes_it(running, tmp_p
     assert sorted(others) == ["reconnected", "resumed"], "the first line may be told before or after the link"
 
 
-def test_a_scan_that_is_started_long_after_its_session_was_created_is_no_lost_scanner(running):
-    service, simulator = running.service(), running.simulator("plate")
+def test_a_scan_that_is_started_long_after_its_session_was_created_is_no_lost_scanner(service, running):
+    simulator = running.simulator("plate")
     session_id = service.create(**device(simulator))
     time.sleep(1.5)  # longer than the driver takes a silence for a lost link
     service.start(session_id)
@@ -228,24 +226,25 @@ def test_a_session_survives_kill_9_with_everything_that_was_acknowledged(running
         ({"start_mm": 1.0, "end_mm": 1.0}, 422, "has no length"),
     ],
 )
-def test_a_source_that_cannot_be_used_is_refused_in_one_sentence(running, source, status, told):
-    service, simulator = running.service(), running.simulator("plate")
+def test_a_source_that_cannot_be_used_is_refused_in_one_sentence(service, running, source, status, told):
+    simulator = running.simulator("plate")
+    before = service.client.get("/api/v1/sessions").json()["sessions"]
     answer = service.client.post("/api/v1/sessions", json={"source": device(simulator, **source)})
     assert (answer.status_code, answer.headers["content-type"]) == (status, "application/problem+json")
     assert told in answer.text
-    assert service.client.get("/api/v1/sessions").json()["sessions"] == []
+    assert service.client.get("/api/v1/sessions").json()["sessions"] == before
 
 
-def test_a_port_in_use_is_refused_by_name(running):
-    service, simulator = running.service(), running.simulator("plate")
+def test_a_port_in_use_is_refused_by_name(service, running):
+    simulator = running.simulator("plate")
     service.create(**device(simulator))
     answer = service.client.post("/api/v1/sessions", json={"source": device(simulator)})
     assert answer.status_code == 409
     assert simulator.port in answer.json()["detail"]
 
 
-def test_a_session_that_was_never_started_lets_go_of_its_port(running):
-    service, simulator = running.service(), running.simulator("plate")
+def test_a_session_that_was_never_started_lets_go_of_its_port(service, running):
+    simulator = running.simulator("plate")
     session_id = service.create(**device(simulator))
     service.client.post(f"/api/v1/sessions/{session_id}/stop")
     again = service.create(**device(simulator))
@@ -256,8 +255,7 @@ def test_a_session_that_was_never_started_lets_go_of_its_port(running):
 
 
 @pytest.mark.parametrize("request_", [b"{}", "[" * 1024, '{"credit": 0}'])
-def test_a_request_that_is_not_understood_ends_the_stream_and_says_so(running, request_):
-    service = running.service()
+def test_a_request_that_is_not_understood_ends_the_stream_and_says_so(service, request_):
     session_id = service.create(kind="push")
     with live_client(service, session_id) as client:
         client.socket.send(request_)
@@ -268,15 +266,13 @@ def test_a_request_that_is_not_understood_ends_the_stream_and_says_so(running, r
     assert json.loads(told)["type"] == "error"
 
 
-def test_numbers_beyond_the_record_are_refused_and_no_fault(running):
-    service = running.service()
+def test_numbers_beyond_the_record_are_refused_and_no_fault(service):
     session_id = service.create(kind="push")
     answer = service.client.get(f"/api/v1/sessions/{session_id}/events", params={"after": 10**20})
     assert answer.status_code == 422
 
 
-def test_pushed_scanlines_are_answered_when_durable_and_stored_once(running):
-    service = running.service()
+def test_pushed_scanlines_are_answered_when_durable_and_stored_once(service):
     session_id = service.create(kind="push")
     service.start(session_id)
     lines = [
@@ -347,8 +343,7 @@ def test_a_withdrawn_pass_leaves_the_map_and_stays_in_the_record(running):
     assert (after["points_counted"], after["unreliable"]) == (300, before["unreliable"])
 
 
-def test_a_fresh_one_time_address_opens_the_viewer_once(running):
-    service = running.service()
+def test_a_fresh_one_time_address_opens_the_viewer_once(service):
     command = [sys.executable, "-m", "scanner_service", "open", "--data", service.data, "--url", service.url, "--json"]
     told = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     address = json.loads(told.stdout)["viewer"]
@@ -358,8 +353,7 @@ def test_a_fresh_one_time_address_opens_the_viewer_once(running):
     assert httpx.get(address).status_code == 401
 
 
-def test_nothing_is_told_without_a_key(running):
-    service = running.service()
+def test_nothing_is_told_without_a_key(service):
     for path in ("/api/v1/sessions", "/metrics"):
         assert httpx.get(service.url + path).status_code == 401
     assert httpx.get(service.url + "/healthz").json() == {"status": "ok"}

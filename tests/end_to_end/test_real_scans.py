@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+from typer.testing import CliRunner
 
+from scanner_service.cli import app
 from scanner_service.storage.formats import ReadOptions, open_cloud
 from tests.end_to_end.test_live_scan import read_ply
 from tests.oracle import Q_MM, Oracle
@@ -29,6 +31,14 @@ needs_bunny = pytest.mark.skipif(not BUNNY.is_dir(), reason="the Stanford range 
 def run(*arguments):
     command = [sys.executable, "-m", "scanner_service", *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=110, check=False)
+
+
+def refusal_of(*arguments):
+    """What a command that is refused says, in this process: it is refused before anything is computed."""
+    done = CliRunner().invoke(app, list(map(str, arguments)))
+    assert done.exit_code == 1
+    assert isinstance(done.exception, SystemExit), "no fault of the program"
+    return done.output
 
 
 def pose_of(name):
@@ -141,21 +151,14 @@ def test_a_file_that_cannot_be_used_is_refused_in_one_sentence(content, told, tm
     file = tmp_path / "scan.ply"
     if content is not None:
         file.write_bytes(content)
-    done = run("replay", file, "--out", tmp_path / "out")
-    assert done.returncode == 1
-    assert told in done.stderr
-    assert "Traceback" not in done.stderr
+    assert told in refusal_of("replay", file, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    "options", [["--line-spacing", "0"], ["--line-spacing", "-1"], ["--density", "nan"], ["--speed", "0"]]
-)
-def test_options_without_sense_are_refused_in_one_sentence(options, tmp_path):
+def test_options_without_sense_are_refused_in_one_sentence(tmp_path):
     file = tmp_path / "profiles.csv"
     rows = [f"{line},{0.2 * k},{0.5 * line},0,3,{0.5 * line},200" for line in range(5) for k in range(8)]
     file.write_text("line,x_mm,y_mm,z_mm,laser_x_mm,laser_y_mm,laser_z_mm\n" + "\n".join(rows) + "\n")
     assert run("replay", file, "--out", tmp_path / "fine").returncode == 0
-    done = run("replay", file, "--out", tmp_path / "out", *options)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
+    for options in ("--line-spacing", "0"), ("--line-spacing", "-1"), ("--density", "nan"), ("--speed", "0"):
+        assert refusal_of("replay", file, "--out", tmp_path / "out", *options).strip()

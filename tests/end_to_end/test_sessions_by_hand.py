@@ -42,8 +42,8 @@ def act(service, session_id, verb):
     return answer.json()
 
 
-def test_a_paused_scan_goes_on_behind_its_last_line_as_another_pass(running):
-    service, simulator = running.service(), running.simulator("plate")
+def test_a_paused_scan_goes_on_behind_its_last_line_as_another_pass(service, running):
+    simulator = running.simulator("plate")
     session_id = service.create(**device(simulator))
     service.start(session_id)
     wait_for(lambda: service.status(session_id)["lines"] > 10, "some lines")
@@ -63,9 +63,11 @@ def test_a_paused_scan_goes_on_behind_its_last_line_as_another_pass(running):
     np.testing.assert_allclose([line["position_mm"] for line in lines], 2.0 + 0.25 * np.arange(81), atol=1e-9)
 
 
-def test_after_an_interruption_longer_than_the_dead_man_the_laser_stays_off_until_somebody_says_so(running, tmp_path):
-    service, link = running.service(), tmp_path / "port"
-    simulator = running.simulator("plate", "--link", link)
+def test_after_an_interruption_longer_than_the_dead_man_the_laser_stays_off_until_somebody_says_so(
+    service, running, tmp_path
+):
+    link = tmp_path / "port"
+    simulator = running.simulator("plate", "--link", link, "--dead-man", 0.5)
     session_id = service.create(**device(simulator, port=str(link)))
     service.start(session_id)
     wait_for(lambda: service.status(session_id)["lines"] > 10, "some lines")
@@ -145,8 +147,7 @@ def test_a_creation_that_is_sent_again_makes_no_second_session_also_after_a_rest
     )
 
 
-def test_a_creation_that_is_sent_again_is_answered_when_its_file_is_gone(running, tmp_path):
-    service = running.service()
+def test_a_creation_that_is_sent_again_is_answered_when_its_file_is_gone(service, tmp_path):
     scan = service.data / "replay" / "scan.csv"
     scan.write_text("line,x_mm,y_mm,z_mm\n" + "".join(f"{n},{x},{n},0\n" for n in range(3) for x in range(5)))
     asked = {"name": "gone", "source": {"kind": "replay", "file": "scan.csv", "laser_mm": [2, 1, 90]}}
@@ -159,8 +160,7 @@ def test_a_creation_that_is_sent_again_is_answered_when_its_file_is_gone(running
     assert service.client.post("/api/v1/sessions", json=asked).status_code == 422
 
 
-def test_a_record_file_is_replayed_over_rest_with_its_own_settings_and_verdict(running, tmp_path):
-    service = running.service()
+def test_a_record_file_is_replayed_over_rest_with_its_own_settings_and_verdict(service, tmp_path):
     path = tmp_path / "made.sqlite"
     with Record.open(path) as record:
         book = SessionBook(record)
@@ -229,8 +229,8 @@ def test_a_command_that_fails_leaves_no_empty_folder(tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-def test_the_command_line_does_what_the_service_does(running):
-    service, simulator = running.service(), running.simulator("plate")
+def test_the_command_line_does_what_the_service_does(service, running):
+    simulator = running.simulator("plate")
     session_id = service.create(**device(simulator))
     runner, where = CliRunner(), ["--data", str(service.data), "--url", service.url]
 

@@ -1,5 +1,6 @@
 """The server: where it listens, and what it does with clients that keep it waiting."""
 
+import contextlib
 import shutil
 import socket
 import ssl
@@ -161,11 +162,12 @@ def test_there_is_a_limit_to_websockets_too(data_dir: Path) -> None:
     with served(small_app(data_dir), limits=limits) as where:
         url = where.url.replace("http", "ws", 1) + "/api/v1/flood"
         headers = {"Authorization": f"Bearer {read_local_key(data_dir)}"}
-        live = [ws_client.connect(url, additional_headers=headers, proxy=None, max_queue=1) for _ in range(3)]
-        with pytest.raises(InvalidStatus, match="503"):
-            ws_client.connect(url, additional_headers=headers, proxy=None)
-        for connection in live:
-            connection.socket.close()
+        with contextlib.ExitStack() as stack:
+            for _ in range(3):
+                client = ws_client.connect(url, additional_headers=headers, proxy=None, max_queue=1, close_timeout=0.1)
+                stack.enter_context(client)
+            with pytest.raises(InvalidStatus, match="503"):
+                stack.enter_context(ws_client.connect(url, additional_headers=headers, proxy=None))
 
 
 @given(st.one_of(st.ip_addresses(v=4), st.ip_addresses(v=6)))

@@ -14,6 +14,7 @@ from scanner_service.sessions.errors import SessionBusy, SourceUnusable
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec
 from scanner_service.sessions.sources import DeviceSource, PassRequest, ReplaySource
+from scanner_service.sessions.withdrawals import SCAN_ENDED
 from scanner_service.storage.errors import CreationKeyReused
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
@@ -44,6 +45,19 @@ def test_a_replay_is_judged_before_it_is_over(book):
     assert session.state == "stopped"
     assert session.results().snapshot.settled.all()
     assert session.results().snapshot.lines.line_index.tolist() == list(range(12))
+
+
+def test_a_scan_is_over_when_its_last_line_is_durable(book):
+    goes_on = threading.Event()
+
+    def lines():
+        book.record._writer.submit(lambda batch: goes_on.wait(20), 0, 0.0)  # a commit that takes its time
+        yield from LINES
+        threading.Timer(1.0, goes_on.set).start()
+
+    session = replay(book, lines())
+    (ended,) = (event.details["lines"] for event in session.past_events() if event.kind == SCAN_ENDED)
+    assert (ended["pending"], ended["stored"]) == (0, 12)
 
 
 def test_a_source_that_breaks_down_fails_its_session_with_what_was_scanned(book):
