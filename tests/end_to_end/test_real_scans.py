@@ -1,8 +1,6 @@
 """Real range scans through the command line, judged by scipy, numpy and the merged surface of the same object."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +27,13 @@ needs_bunny = pytest.mark.skipif(not BUNNY.is_dir(), reason="the Stanford range 
 
 
 def run(*arguments):
-    command = [sys.executable, "-m", "scanner_service", *map(str, arguments)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=110, check=False)
+    """A command in this process, which has its kernels already; other tests start it as a user does."""
+    return CliRunner().invoke(app, list(map(str, arguments)))
 
 
 def refusal_of(*arguments):
-    """What a command that is refused says, in this process: it is refused before anything is computed."""
-    done = CliRunner().invoke(app, list(map(str, arguments)))
+    """What a command that is refused says."""
+    done = run(*arguments)
     assert done.exit_code == 1
     assert isinstance(done.exception, SystemExit), "no fault of the program"
     return done.output
@@ -72,7 +70,7 @@ def faces_of_merged_surface():
 @pytest.mark.parametrize("name", sorted(VERTICES))
 def test_a_real_scan_is_accounted_for_exact_and_turned_the_right_way(name, tmp_path):
     done = run("replay", BUNNY / f"{name}.ply", "--out", tmp_path, "--json")
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     summary = json.loads(done.stdout)
     assert summary == json.loads((tmp_path / "summary.json").read_text())
     source = summary["losses"]["device"]
@@ -109,8 +107,8 @@ def test_a_real_scan_is_accounted_for_exact_and_turned_the_right_way(name, tmp_p
 def test_a_record_played_again_gives_the_same_files_bit_for_bit(tmp_path):
     first, again = tmp_path / "first", tmp_path / "again"
     record = tmp_path / "scan.sqlite"
-    assert run("replay", BUNNY / "bun000.ply", "--out", first, "--record", record).returncode == 0
-    assert run("replay", record, "--out", again).returncode == 0
+    assert run("replay", BUNNY / "bun000.ply", "--out", first, "--record", record).exit_code == 0
+    assert run("replay", record, "--out", again).exit_code == 0
     assert (first / "points.ply").read_bytes() == (again / "points.ply").read_bytes()
     for regions in ("regions.json",):
         a, b = (json.loads((folder / regions).read_text()) for folder in (first, again))
@@ -124,7 +122,7 @@ def test_a_record_played_again_gives_the_same_files_bit_for_bit(tmp_path):
 )
 def test_a_plain_cloud_is_analysed_with_every_rule(rule, tmp_path):
     done = run("analyse", BUNNY / "bun_zipper.ply", "--units", "m", *rule, "--out", tmp_path, "--json")
-    assert done.returncode == 0, done.stderr
+    assert done.exit_code == 0, done.stderr
     summary = json.loads(done.stdout)
     rows = read_ply((tmp_path / "points.ply").read_bytes())
     assert len(rows) == summary["points"] == 35947
@@ -159,6 +157,6 @@ def test_options_without_sense_are_refused_in_one_sentence(tmp_path):
     file = tmp_path / "profiles.csv"
     rows = [f"{line},{0.2 * k},{0.5 * line},0,3,{0.5 * line},200" for line in range(5) for k in range(8)]
     file.write_text("line,x_mm,y_mm,z_mm,laser_x_mm,laser_y_mm,laser_z_mm\n" + "\n".join(rows) + "\n")
-    assert run("replay", file, "--out", tmp_path / "fine").returncode == 0
+    assert run("replay", file, "--out", tmp_path / "fine").exit_code == 0
     for options in ("--line-spacing", "0"), ("--line-spacing", "-1"), ("--density", "nan"), ("--speed", "0"):
         assert refusal_of("replay", file, "--out", tmp_path / "out", *options).strip()
