@@ -11,6 +11,8 @@ from pathlib import Path
 
 import httpx
 
+from scanner_service.storage.reader import RecordReader
+
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 300.0
 
@@ -62,6 +64,20 @@ class RunningService:
         answer = self.client.get(f"/api/v1/sessions/{session_id}")
         assert answer.status_code == 200, answer.text
         return answer.json()
+
+    def kept_account(self, session_id):
+        """The account of losses that the record holds of a session; empty before the first."""
+        with contextlib.closing(RecordReader.open(self.data / "record.sqlite")) as reader:
+            return reader.ledger(session_id) or {}
+
+    def wait_until_kept(self, session_id):
+        """Wait until the record holds the account of losses that the service tells."""
+
+        def is_kept():
+            kept, told = self.kept_account(session_id), self.status(session_id)["losses"]
+            return all(kept.get(part) == told[part] for part in ("lines", "points", "passes"))
+
+        wait_for(is_kept, f"the account of session {session_id} to be in the record")
 
     def wait_for_state(self, session_id, state):
         wait_for(lambda: self.status(session_id)["state"] == state, f"session {session_id} to be {state}")

@@ -104,7 +104,7 @@ def test_a_killed_scan_is_reopened_with_its_ledger_its_notes_and_the_same_verdic
     service.start(killed_id)
     wait_for(lambda: (service.status(killed_id)["losses"]["passes"] or [{"lines": {"stored": 0}}])[0]["lines"]["stored"]
              > 20, "some lines")  # fmt: skip
-    time.sleep(1.5)  # the ledger is kept about every second
+    wait_for(lambda: service.kept_account(killed_id).get("elapsed_s", 0) > 0, "an account in the record")
     service.kill()
 
     service = running.service()
@@ -283,9 +283,8 @@ def test_points_and_ledger_are_the_same_after_push_stop_start_and_push_to_the_sa
     push(3, 2)
     address = f"/api/v1/sessions/{session_id}/points?limit=10000"
     wait_for(lambda: service.client.get(address).json()["total"] == 800, "the points to be judged")
-    live = service.client.get(address).json()
+    service.wait_until_kept(session_id)
     ledger = service.client.get(f"/api/v1/sessions/{session_id}/ledger").json()
-    time.sleep(2.5)  # verdict and ledger are kept about every second
     live = service.client.get(address).json()
     service.kill()
     service = running.service()
