@@ -133,17 +133,26 @@ class PassDrive:
         return stage_speed(limits, self.order, rate_hz if math.isfinite(rate_hz) else self._measured_rate())
 
     def _measured_rate(self) -> float:
-        """Line rate by the scanner's own clock, over 0.6 s at rest."""
-        times: list[float] = []
+        """Line rate by the scanner's own clock and count of lines, over 0.6 s at rest."""
+        seen: list[Profile] = []
         end_s = self.clock() + _MEASURE_RATE_S
-        while (self.clock() < end_s or len(times) < 3) and not self.stopping.is_set():
+        while (self.clock() < end_s or len(seen) < 3) and not self.stopping.is_set():
             for profile in self.fetch(LOOK_S):
                 self.enter_early(profile)
-                times.append(profile.device_time_s)
+                seen.append(profile)
             if self.clock() > end_s + FIRST_PROFILE_S:
                 raise ScannerSilent(
                     "the scanner sends no profiles while the stage rests, so that its line rate cannot be measured; "
                     "give the pass a speed, or line_rate_hz in the rig file"
                 )
-        gaps = sorted(later - earlier for earlier, later in pairwise(times))
-        return 1.0 / gaps[len(gaps) // 2] if gaps and gaps[len(gaps) // 2] > 0 else 1.0
+        return _line_rate(seen)
+
+
+def _line_rate(profiles: list[Profile]) -> float:
+    """Lines a second by the middle one of the gaps, lines that are missing counted in; 1 when there is no gap."""
+    gaps = sorted(
+        (later.device_time_s - earlier.device_time_s) / (later.line_index - earlier.line_index)
+        for earlier, later in pairwise(profiles)
+        if later.line_index > earlier.line_index
+    )
+    return 1.0 / gaps[len(gaps) // 2] if gaps and gaps[len(gaps) // 2] > 0 else 1.0

@@ -39,6 +39,7 @@ class PassLines:
         self._counted_from_mm = math.nan
         self._counted_since_s = math.inf
         self._first_counted: int | None = None
+        self._uncounted: Profile | None = None  # the latest one that was exposed before the stage set off
         self.counted_to_mm = math.nan
         """The place that the latest counted profile came to, also beyond the end of the pass; NaN before the first."""
         self._counted_times: deque[float] = deque(maxlen=1_000)
@@ -58,15 +59,17 @@ class PassLines:
     def by_count(self, profile: Profile, speed_mm_per_s: float) -> None:
         """The k-th profile since `count_from` at the k-th place; what was exposed earlier is left out.
 
+        Profiles that are missing count: they were made, and have numbers.
         Its place is uncertain by one line spacing, since the stage may set off at any moment of a line's period, and
         by speed times the uncertainty of the latency.
         """
         self.only_clock(profile)
         if self._first_counted is None and self.exposure_s(profile) < self._counted_since_s:
+            self._uncounted = profile
             self.leave_out(profile, "before_start")
             return
         if self._first_counted is None:
-            self._first_counted = profile.line_index
+            self._first_counted = self._first_since(profile)
         spacing_mm = self.order.line_spacing_mm
         at_mm = self._counted_from_mm + self.order.sign * (profile.line_index - self._first_counted) * spacing_mm
         self.counted_to_mm = at_mm
@@ -149,6 +152,21 @@ class PassLines:
     def _count(self) -> None:
         with self._lock:
             self._accounts.profiles += 1
+
+    def _first_since(self, profile: Profile) -> int:
+        """Return the number of the first profile after the stage set off; `profile` is the first of them that arrived.
+
+        Those that are missing before it were made at even times after the last early one.
+        """
+        early = self._uncounted
+        if early is None or early.boot_id != profile.boot_id or profile.line_index <= early.line_index + 1:
+            return profile.line_index
+        early_s = self.exposure_s(early)
+        period_s = (self.exposure_s(profile) - early_s) / (profile.line_index - early.line_index)
+        if period_s <= 0.0:
+            return profile.line_index
+        number = early.line_index + math.ceil((self._counted_since_s - early_s) / period_s)
+        return min(max(number, early.line_index + 1), profile.line_index)
 
     def _leave_out_counted(self, profile: Profile, reason: str) -> None:
         self._left_out.enter(profile, reason)

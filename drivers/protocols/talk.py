@@ -51,6 +51,7 @@ class Talk(ABC):
         self._advise = advise
         self._rates = rates
         self._heard_s = 0.0
+        self._answered_at: int | None = None  # the rate at which somebody answered last
         self._dialogue: Dialogue | None = None
 
     # ---- what a protocol brings -------------------------------------------------------------------------------------
@@ -144,15 +145,21 @@ class Talk(ABC):
     def _find_rate(self, meet: Callable[[], Script[_Found | None]]) -> Script[_Found]:
         """Try the rates one after the other, the present one first, until `meet` brings something.
 
+        A rate at which somebody has answered before is tried again between the others: on a link that came back an
+        answer may be lost, and all the other rates take long.
+
         Raises
         ------
         ScannerSilent : it never does.
         """
         before = self.heard_bytes
-        for rate in dict.fromkeys((self.baud_rate, *self._rates)):
+        first, *others = dict.fromkeys((self.baud_rate, *self._rates))
+        likely = () if self._answered_at is None else (self._answered_at,)
+        for rate in (first, *(rate for other in others for rate in (other, *likely))):
             self.baud_rate = rate
             found = yield from meet()
             if found:
+                self._answered_at = rate
                 return found
         tried = ", ".join(map(str, dict.fromkeys(self._rates)))
         raise ScannerSilent(self._nobody(tried, heard=self.heard_bytes > before))
@@ -168,6 +175,7 @@ class Talk(ABC):
             self.baud_rate = rate
             yield Pause(0.05)
             if (yield from meet()):
+                self._answered_at = rate
                 if rate == old:
                     self._advise(f"the scanner agreed to {new} baud and cannot be understood there; it stays at {old}")
                 return

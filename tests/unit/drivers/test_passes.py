@@ -15,7 +15,9 @@ from drivers.passes.stopping import Stopping
 from drivers.passes.told import RigPassEnded, Told
 from drivers.passes.with_device import run_with_device
 from drivers.protocols.scanner_events import Advice, ClockJumped
+from drivers.rig_description import PairBy
 from drivers.rig_file import parse_rig
+from drivers.rig_limits import PassOrder
 from drivers.running_rig import RunningRig
 from drivers.scanline import Scanline
 from scanner_service.sessions.rig_source import Preparation, RigSource
@@ -107,6 +109,30 @@ def test_stage_and_scanner_that_go_and_come_back_in_any_order_go_on_to_the_end(o
     at_mm = np.array([line.position_mm for line in drive.told.take(0.0) if isinstance(line, Scanline)])
     assert at_mm.max() == pytest.approx(10.0, abs=0.51)
     assert np.diff(np.sort(at_mm)).max() < 0.51
+
+
+@pytest.mark.parametrize(
+    "skipped", [(), range(2, 30, 2), (5, 6, 7, 20), range(3, 40, 4), *((number,) for number in range(12, 20))]
+)
+def test_counted_lines_keep_their_places_where_others_are_missing(skipped):
+    shop, _, scanner, drive = bench(PassOrder(0.0, 10.0, 0.5), PairBy.COUNT)  # the speed is chosen by the rate
+    scanner.skipped = frozenset(skipped)
+    MotionPass(drive, scanner).run()
+    told = drive.told.take(0.0)
+    lines = [event for event in told if isinstance(event, Scanline)]
+    numbers = np.array([line.line_index for line in lines])
+    at_mm = np.array([line.position_mm for line in lines])
+    first = numbers[0] - round(at_mm[0] / 0.5)
+    np.testing.assert_allclose(at_mm, 0.5 * (numbers - first))
+    assert all(number in skipped for number in range(first, numbers[0]))
+    assert sorted({*range(numbers[0], numbers[-1] + 1)} - {*numbers}) == [
+        number for number in skipped if numbers[0] < number < numbers[-1]
+    ]
+    # A line was exposed when its time tells: by then the stage had gone the way that its place says, to one spacing.
+    set_off_s = shop.moved_s[-1]
+    truly_mm = 10.0 * (np.array([line.device_time_s for line in lines]) - set_off_s)
+    assert np.abs(truly_mm - at_mm).max() <= drive.lines.report().largest_uncertainty_mm + 1e-6
+    assert not [event for event in told if isinstance(event, Advice)]
 
 
 def rig(makes_stage=BenchStage):
