@@ -13,6 +13,7 @@ DriverError
 |   |-- ScannerSilent           nothing intelligible answers
 |   |-- ScannerTimeout          a command was not acknowledged
 |   |-- ScannerRefused          a command was refused, with the reason
+|   |   `-- PassRefused         a pass that it cannot drive; asking again does not help
 |   |-- ScannerNotConnected     a command was given while no device is there
 |   `-- ProtocolUnsupported     the device speaks another version of the protocol
 |-- StageError                  what moves, behind its tty
@@ -84,6 +85,10 @@ class ScannerTimeout(ScannerError):
 
 class ScannerRefused(ScannerError):
     """The device refused a command; the message says why."""
+
+
+class PassRefused(ScannerRefused):
+    """The device cannot drive the pass as it was ordered; asking for the same once more does not help."""
 
 
 class ScannerNotConnected(ScannerError):

@@ -4,6 +4,7 @@ The kernel may give a replugged adapter another number. Names that last: a link 
 serial number), one in /dev/serial/by-path (which socket), or `usb:VID:PID:SERIAL`, which is looked up here.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -101,6 +102,19 @@ def find_port(name: str, ports: list[PortName] | None = None) -> str:
         names = ", ".join(port.usb_name if port.serial else port.by_path or port.path for port in matching)
         raise PortError(name, f"{len(matching)} adapters answer to {name}; name one of {names}")
     return matching[0].path
+
+
+def is_among(name: str, others: Iterable[str]) -> bool:
+    """Return whether one of the other names leads to the same port as `name`, which is there."""
+
+    def real(one: str) -> Path | None:
+        try:
+            return Path(find_port(one)).resolve()
+        except (PortError, OSError, RuntimeError, ValueError):  # absent, a loop of links, half a character
+            return None
+
+    here = real(name)
+    return here is not None and any(real(other) == here for other in others)
 
 
 def _children(folder: Path) -> list[Path]:

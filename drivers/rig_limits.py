@@ -12,6 +12,8 @@ from drivers.scanline import SensorGeometry
 
 Interval = tuple[float, float]
 """(lowest, highest)."""
+_SPACING_SLACK = 0.01
+"""Share by which an ordered line spacing may lie beyond what speeds and rates give: people round."""
 
 
 class AxisKind(StrEnum):
@@ -100,6 +102,25 @@ class RigLimits:
             if not low <= at_mm <= high:
                 return f"the {name} at {at_mm:g} mm is outside the stage's travel of {low:g} to {high:g} mm"
         return None
+
+    def why_not_spaced(self, order: "PassOrder") -> str | None:
+        """Return one sentence on why lines cannot come as far apart as ordered, in motion; None when they can."""
+        if order.speed_mm_per_s == 0:
+            return None
+        slowest, fastest = self.speed_mm_per_s
+        if order.speed_mm_per_s > 0:
+            slowest = fastest = order.speed_mm_per_s
+        lowest_hz, highest_hz = self.line_rate_hz
+        finest_mm = slowest / highest_hz if highest_hz > 0 else 0.0
+        coarsest_mm = fastest / lowest_hz if lowest_hz > 0 else math.inf
+        if finest_mm * (1.0 - _SPACING_SLACK) <= order.line_spacing_mm <= coarsest_mm * (1.0 + _SPACING_SLACK):
+            return None
+        bound = (
+            f"at least {finest_mm:.4g} mm apart: {slowest:g} mm/s at {highest_hz:g}"
+            if order.line_spacing_mm < finest_mm
+            else f"at most {coarsest_mm:.4g} mm apart: {fastest:g} mm/s at {lowest_hz:g}"
+        )
+        return f"lines {order.line_spacing_mm:g} mm apart cannot be had; they come {bound} lines a second"
 
 
 @dataclass(frozen=True, slots=True)

@@ -181,6 +181,9 @@ class RunningRig:
         why = self.limits.why_not(order.start_mm, order.end_mm)
         if why is not None:
             raise DriverError(f"{why}; choose other ends, or correct the rig file")
+        why = self.limits.why_not_spaced(order)
+        if why is not None:
+            raise DriverError(f"{why}; order another spacing or speed, or correct the rig file")
         highest = self.limits.speed_mm_per_s[1]
         if order.speed_mm_per_s > highest:
             raise DriverError(f"a speed of {order.speed_mm_per_s:g} mm/s is above the stage's {highest:g} mm/s")

@@ -4,11 +4,10 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 from drivers.errors import ScannerSilent
 from drivers.passes.lines import PassLines
-from drivers.passes.speeds import approach_speed, stage_speed
+from drivers.passes.speeds import approach_speed, line_rate_of, stage_speed
 from drivers.passes.stopping import Stopping
 from drivers.passes.told import Told
 from drivers.protocols.scanner_events import ScannerEvent
@@ -145,14 +144,4 @@ class PassDrive:
                     "the scanner sends no profiles while the stage rests, so that its line rate cannot be measured; "
                     "give the pass a speed, or line_rate_hz in the rig file"
                 )
-        return _line_rate(seen)
-
-
-def _line_rate(profiles: list[Profile]) -> float:
-    """Lines a second by the middle one of the gaps, lines that are missing counted in; 1 when there is no gap."""
-    gaps = sorted(
-        (later.device_time_s - earlier.device_time_s) / (later.line_index - earlier.line_index)
-        for earlier, later in pairwise(profiles)
-        if later.line_index > earlier.line_index
-    )
-    return 1.0 / gaps[len(gaps) // 2] if gaps and gaps[len(gaps) // 2] > 0 else 1.0
+        return line_rate_of(seen) or 1.0

@@ -2,17 +2,22 @@
 
 import math
 
-from drivers.errors import ScannerSilent, StageNotConnected
+from drivers.errors import DriverError, ScannerSilent, StageNotConnected
 from drivers.passes.drive import LOOK_S, PassDrive
+from drivers.passes.speeds import line_rate_of
 from drivers.protocols.scanner_events import Advice, Disconnected, PassNotResumed, PassResumed, Reconnected
 from drivers.protocols.stage_events import StageDisconnected, StageReconnected
 from drivers.rig_description import PairBy
+from drivers.scanline import Profile
 from drivers.scanners.face import FreeRunningScanner
 from drivers.stages.unmoved import ConstantSpeed
 
 _BACK_S = 120.0
 _ARRIVAL_S = 0.3
 """A stage is asked a few times a second whether it has arrived; a scanner that runs free goes on meanwhile."""
+_JUDGED_AFTER = 100
+_SPACING_FACTOR = 2.0
+"""How many times as far as ordered lines on a conveyor may come apart before the order is nonsense."""
 _COUNT_SLACK = 0.02
 """Share by which the spacing that clock and speed tell may differ from the one that was counted with."""
 
@@ -26,6 +31,8 @@ class MotionPass:
         self._by_count = drive.pairs_by is PairBy.COUNT
         self._speed = 0.0
         self._stage_is_back = False  # it was gone and came back since it set off
+        self._spacing_is_judged = False
+        self._seen: list[Profile] = []  # the first ones, until the spacing is judged
         self._counted_mm = math.nan  # up to the last round before the stage arrived
 
     def run(self) -> None:
@@ -41,6 +48,7 @@ class MotionPass:
                 lines.by_time(profile)
         self._speed = drive.speed()
         self._set_off(order.start_mm)
+        self._spacing_is_judged = drive.driven is not None
         while not drive.stopping.is_set():
             arrived = was_lost = stage_is_gone = False
             try:
@@ -77,11 +85,33 @@ class MotionPass:
         drive.lines.count_from(from_mm, drive.clock())
 
     def _take(self, timeout_s: float) -> None:
-        for profile in self._drive.fetch(timeout_s):
+        profiles = self._drive.fetch(timeout_s)
+        for profile in profiles:
             if self._by_count:
                 self._drive.lines.by_count(profile, self._speed)
             else:
                 self._drive.lines.by_time(profile)
+        if not self._spacing_is_judged:
+            self._judge_spacing(profiles)
+
+    def _judge_spacing(self, profiles: list[Profile]) -> None:
+        """A conveyor goes at its own speed: refuse a spacing that is far finer than the one in which lines come."""
+        self._seen += profiles
+        rate_hz = line_rate_of(self._seen)
+        if rate_hz is None and len(self._seen) < _JUDGED_AFTER:
+            return
+        self._spacing_is_judged = True
+        self._seen.clear()
+        if rate_hz is None:  # its clock does not go on: nobody can tell
+            return
+        spacing_mm, ordered_mm = self._speed / rate_hz, self._drive.order.line_spacing_mm
+        come = f"at {self._speed:g} mm/s and {rate_hz:.3g} lines a second they come {spacing_mm:.4g} mm apart"
+        if ordered_mm < spacing_mm / _SPACING_FACTOR:
+            raise DriverError(
+                f"lines {ordered_mm:g} mm apart cannot be had: {come}; order that spacing, or slow down the stage"
+            )
+        if ordered_mm > spacing_mm * _SPACING_FACTOR:
+            self._drive.told.event(Advice(f"lines {ordered_mm:g} mm apart were ordered, but {come}"))
 
     def _is_beyond(self) -> bool:
         """True when a stage that the host does not drive has gone through the pass."""

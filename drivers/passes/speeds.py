@@ -1,9 +1,12 @@
 """How fast a pass is driven: speed of the stage, rate of the scanner; numbers only, knows no device."""
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 from drivers.errors import DriverError
 from drivers.rig_limits import PassOrder, RigLimits
+from drivers.scanline import Profile
 
 _UNBOUNDED_MM_PER_S = 20.0
 
@@ -27,6 +30,21 @@ def line_rate(limits: RigLimits, order: PassOrder) -> float:
     if not math.isfinite(rate_hz):
         raise DriverError("give the pass a speed, or line_rate_hz and speed_mm_per_s in the rig file")
     return rate_hz
+
+
+def line_rate_of(profiles: Sequence[Profile]) -> float | None:
+    """Return lines a second by the scanner's own clock, lines that are missing counted in; None of less than three.
+
+    It is that of the middle gap: one that a clock got wrong does not matter.
+    """
+    gaps_s = sorted(
+        (later.device_time_s - earlier.device_time_s) / (later.line_index - earlier.line_index)
+        for earlier, later in pairwise(profiles)
+        if later.line_index > earlier.line_index
+    )
+    if len(gaps_s) < 2 or not gaps_s[len(gaps_s) // 2] > 0:
+        return None
+    return 1.0 / gaps_s[len(gaps_s) // 2]
 
 
 def stage_speed(limits: RigLimits, order: PassOrder, rate_hz: float) -> float:

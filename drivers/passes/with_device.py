@@ -7,10 +7,13 @@ from drivers.errors import ScannerSilent, StageStopped
 from drivers.pairing import StagePosition
 from drivers.passes.drive import LOOK_S, PassDrive
 from drivers.passes.speeds import line_rate
-from drivers.protocols.scanner_events import PassEnded, PassNotResumed
+from drivers.protocols.scanner_events import Advice, PassEnded, PassNotResumed
 from drivers.rig_description import PairBy
 from drivers.scanners.native import NativeScanner
 from drivers.stages.unmoved import ConstantSpeed
+
+_WIRE_SHARE = 0.95
+"""Share of the wire's time that lines may fill where the rig chooses their rate: answers need the rest."""
 
 
 def run_with_device(drive: PassDrive, scanner: NativeScanner) -> str:
@@ -21,7 +24,7 @@ def run_with_device(drive: PassDrive, scanner: NativeScanner) -> str:
     DriverError : it cannot be started, or an interrupted one does not go on.
     """
     order, lines = drive.order, drive.lines
-    rate_hz = line_rate(drive.description.limits, order)
+    rate_hz = _rate_that_fits(drive, scanner.most_lines_per_s)
     by_time = drive.pairs_by is PairBy.TIME
     if drive.driven is not None:
         drive.move_to(drive.driven, order.start_mm)
@@ -51,3 +54,31 @@ def run_with_device(drive: PassDrive, scanner: NativeScanner) -> str:
             raise ScannerSilent(ended.reason)
         if is_over and ended is not None:
             return ended.reason
+
+
+def _rate_that_fits(drive: PassDrive, most_hz: float) -> float:
+    """Return the line rate: as ordered, else the fastest that limits and wire allow; what the wire loses is told.
+
+    Whether a USB port carries more than its baud rate says, nobody can tell: what was ordered is done.
+    """
+    order = drive.order
+    rate_hz = line_rate(drive.description.limits, order)
+    if rate_hz <= most_hz:
+        return rate_hz
+    full = f"at its baud rate the port has time for {most_hz:.3g} lines a second"
+    fits_mm_per_s = _WIRE_SHARE * most_hz * order.line_spacing_mm
+    if math.isnan(order.speed_mm_per_s) and not isinstance(drive.stage, ConstantSpeed):
+        drive.told.event(
+            Advice(
+                f"{full}: the pass goes at {fits_mm_per_s:.3g} mm/s; raise the baud rate, or order a higher speed "
+                "where the port is USB and its rate only a name"
+            )
+        )
+        return _WIRE_SHARE * most_hz
+    drive.told.event(
+        Advice(
+            f"{full}, and {rate_hz:.3g} are ordered: lines will be lost, and counted; go at {fits_mm_per_s:.3g} mm/s "
+            "or less, space the lines wider, or raise the baud rate"
+        )
+    )
+    return rate_hz

@@ -63,6 +63,12 @@ def frame(body: bytes) -> bytes:
     return b"\0" + bytes(cobs.encode(body + crc)) + b"\0"
 
 
+def most_frame_bytes(body_bytes: int) -> int:
+    """Return the most bytes that a body of that length takes on the wire."""
+    content = body_bytes + _CRC_BYTES
+    return content + 1 + content // 254 + 2
+
+
 class FrameDecoder:
     """Cuts a stream of bytes into intact bodies and damage; keeps at most one frame's bytes.
 

@@ -11,7 +11,15 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from drivers.protocols.framing import MAX_BODY_BYTES, Body, Damage, DamageReason, FrameDecoder, frame
+from drivers.protocols.framing import (
+    MAX_BODY_BYTES,
+    Body,
+    Damage,
+    DamageReason,
+    FrameDecoder,
+    frame,
+    most_frame_bytes,
+)
 from drivers.protocols.native_messages import (
     MAX_TEXT_BYTES,
     NM_PER_MM,
@@ -82,6 +90,12 @@ def encode(message: Message) -> bytes:
             return frame(bytes([Type.KEEPALIVE]) + _COMMAND.pack(command_id))
         case EndSeen(command_id, pass_index):
             return frame(bytes([Type.END_SEEN]) + _END_SEEN.pack(command_id, pass_index))
+
+
+def line_bytes(n_points: int) -> int:
+    """Return the most bytes that a line of so many points takes on the wire."""
+    n_chunks = -(-n_points // MAX_POINTS_PER_CHUNK)
+    return n_chunks * most_frame_bytes(1 + _CHUNK.size) + n_points * _POINT_BYTES + n_points * _POINT_BYTES // 254
 
 
 class Decoder:

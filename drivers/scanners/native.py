@@ -4,6 +4,7 @@ The conversation itself is `drivers.protocols.native_host`, which knows no port;
 the bounded queue behind it are `link.py`.
 """
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from typing import Self
 
 from drivers.errors import (
     DriverError,
+    PassRefused,
     ProtocolUnsupported,
     ScannerNotConnected,
     ScannerRefused,
@@ -19,8 +21,9 @@ from drivers.errors import (
     ScannerTimeout,
 )
 from drivers.patience import wait_patiently
+from drivers.protocols.native import line_bytes
 from drivers.protocols.native_host import NativeHost, Phase
-from drivers.protocols.native_messages import PROTOCOL_VERSION
+from drivers.protocols.native_messages import PROTOCOL_VERSION, AckStatus, Start
 from drivers.protocols.native_requests import PassPlan, Request, describe_failure
 from drivers.scanline import DeviceInfo
 from drivers.scanners.face import Happening
@@ -30,6 +33,7 @@ from drivers.tally import Tally
 _ENTER_S = 4.0
 _EXIT_S = 1.0
 _END_S = 5.0
+_BITS_PER_BYTE = 10
 
 
 class NativeScanner:
@@ -118,6 +122,7 @@ class NativeScanner:
         ------
         ValueError : when a value cannot be a pass.
         ScannerRefused, ScannerTimeout, ScannerNotConnected : when the device does not do it.
+        PassRefused : when it cannot.
         """
         if not (line_spacing_mm > 0 and line_rate_hz > 0):
             raise ValueError(
@@ -134,6 +139,19 @@ class NativeScanner:
             self._switch_off()
             raise
         return plan.index or 0
+
+    @property
+    def port_path(self) -> str:
+        """The port as it was named."""
+        return self._path
+
+    @property
+    def most_lines_per_s(self) -> float:
+        """Lines a second for which the wire has time at its baud rate; infinite before the scanner is entered."""
+        with self._changed:
+            info = self._host.info
+        bytes_per_s = self._baud_rate / _BITS_PER_BYTE
+        return math.inf if info is None else bytes_per_s / line_bytes(info.points_per_line)
 
     def stop_pass(self) -> None:
         """Stop the pass and switch the laser off; returns when its last lines and `PassEnded` are in `events`.
@@ -233,7 +251,8 @@ class NativeScanner:
         if request.ack is None:
             raise ScannerTimeout(f"{describe_failure(request)}; check cable and power of {self._path}")
         if not request.ok:
-            raise ScannerRefused(describe_failure(request))
+            is_order = isinstance(request.command, Start) and request.ack.result is AckStatus.BAD_VALUE
+            raise (PassRefused if is_order else ScannerRefused)(describe_failure(request))
 
     def _describe_silence(self, heard_bytes: int) -> str:
         where = f"{self._path} at {self._baud_rate} baud"

@@ -5,7 +5,7 @@ from starlette.responses import FileResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
-from drivers.errors import DriverError, PortAbsent, PortBusy, PortNotPermitted
+from drivers.errors import DriverError, PassRefused, PortAbsent, PortBusy, PortNotPermitted
 from scanner_service import __version__, web
 from scanner_service.analysis.errors import MapFull, MethodRefused, MethodUnknown, TooManyPasses
 from scanner_service.api.access import ACCESS_PROBLEMS
@@ -53,8 +53,9 @@ SESSION_PROBLEMS: ProblemTable = {
     FormatError: Problem(422, "file-unusable", "The file cannot be read"),
     LineRefused: Problem(409, "line-refused", "The scanline was not taken"),
     PortAbsent: Problem(404, "port-absent", "There is no such port"),
-    PortBusy: Problem(409, "port-busy", "Another program holds the port"),
+    PortBusy: Problem(409, "port-busy", "The port is held"),
     PortNotPermitted: Problem(403, "port-not-permitted", "The port may not be opened"),
+    PassRefused: Problem(422, "pass-refused", "The scanner cannot drive this pass"),
     DriverError: Problem(502, "scanner-error", "The scanner does not do its part"),
     TooManyPasses: Problem(409, "too-many-passes", "Too many passes are open"),
     TimeoutError: Problem(503, "record-slow", "The disk does not answer"),

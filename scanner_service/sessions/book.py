@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 
+from drivers.errors import PortBusy
+from drivers.port_names import is_among
 from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.sessions.calibration import calibration_after, calibration_of, geometry_from, towards_sensor_from
 from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SessionError
@@ -17,7 +19,7 @@ from scanner_service.sessions.retention import OVER, Kept, Retention, choose
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec, SourceSpec, let_go
-from scanner_service.sessions.sources import PushSource, Source, SpentSource
+from scanner_service.sessions.sources import OnPorts, PushSource, Source, SpentSource
 from scanner_service.sessions.withdrawals import SERVICE_ENDED
 from scanner_service.storage.errors import RecordError
 from scanner_service.storage.record import Record, utc_now
@@ -25,6 +27,8 @@ from scanner_service.storage.rows import CreationKey, SessionRow
 
 _LOG = logging.getLogger(__name__)
 MAX_LIVE = 16
+_HOLDING = ("created", "scanning", "paused")
+"""States in which a session has its ports open."""
 
 
 @dataclass(slots=True)
@@ -149,7 +153,7 @@ class SessionBook:
         self.make_room_on_disk()
         with self._lock:
             self._make_room()
-            opened = spec.open() if source is None else source
+            opened = self._open(spec) if source is None else source
             try:
                 row = self.record.create_session(
                     name,
@@ -169,6 +173,21 @@ class SessionBook:
             except BaseException:
                 opened.stop()
                 raise
+
+    def _open(self, spec: SourceSpec) -> Source:
+        """Open a source; when a port is held by a session of this book, say by which."""
+        try:
+            return spec.open()
+        except PortBusy as error:
+            for session in self._live.values():
+                source = session.source
+                if session.state in _HOLDING and isinstance(source, OnPorts) and is_among(error.path, source.ports):
+                    raise PortBusy(
+                        error.path,
+                        f"{error.path} is held by session {session.row.session_id} ({session.row.name}), which is "
+                        f"{session.state}; stop that one first",
+                    ) from error
+            raise
 
     def get(self, session_id: str, on_progress: Callable[[int], None] = lambda lines: None) -> LiveSession:
         """The session, reopened from the record when nobody holds it open: the map is built from its lines.

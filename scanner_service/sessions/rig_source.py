@@ -52,6 +52,7 @@ class RigSource:
         self.towards_sensor: Float64Array | None = rig.pose_at(order.start_mm).rotate(np.array([0.0, 0.0, 1.0]))
         self.info = info
         self.description = description
+        self.ports = tuple(choice.port for choice in (description.scanner, description.stage) if choice.port)
         self.is_driven = rig.is_driven
         self.rests_at_mm: float | None = None
         self._rig = rig

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from drivers.errors import PassRefused
 from drivers.scanline import Scanline
 from drivers.tally import PassTally
 from scanner_service.analysis.intake import StoredLine
@@ -108,6 +109,7 @@ class LiveSession:
         Raises
         ------
         SessionBusy : the session is scanning, or its source was used up.
+        PassRefused : the scanner cannot drive this pass at all; the session has failed, and let go of it.
         SourceUnusable, DriverError : the source cannot start; the state is unchanged.
         """
         with self._lock:
@@ -121,6 +123,10 @@ class LiveSession:
             self._time.start()
             try:
                 self.source.start(self)
+            except PassRefused as error:
+                self.source.stop()
+                self._finish(str(error))
+                raise
             except BaseException:
                 self._time.stop()
                 self._state = before

@@ -99,9 +99,10 @@ class RigSpec:
     def open(self) -> Source:
         """Read the file, open both ports and greet both devices; raises SourceUnusable or a DriverError."""
         order, description = self.order(), read_rig(self.file)
-        why = description.limits.why_not(self.start_mm, self.end_mm)
+        limits = description.limits
+        why = limits.why_not(self.start_mm, self.end_mm) or limits.why_not_spaced(order)
         if why is not None:
-            raise SourceUnusable(f"{why}; choose other ends, or correct the rig file")
+            raise SourceUnusable(f"{why}; order another pass, or correct the rig file")
         rig = RunningRig(description)
         return RigSource(rig, order, rig.enter(), Preparation(self.home, self.at_mm), description)
 

@@ -102,6 +102,14 @@ class OnAWire(Protocol):
         """Chunks and lines of each pass."""
 
 
+@runtime_checkable
+class OnPorts(Protocol):
+    """A source that holds serial ports from its making until it is stopped or at its end."""
+
+    ports: tuple[str, ...]
+    """As the user names them."""
+
+
 @dataclass(frozen=True, slots=True)
 class PassRequest:
     """One pass of the stage, from `start_mm` to `end_mm`, lines `line_spacing_mm` apart.
@@ -124,6 +132,7 @@ class DeviceSource:
         self.geometry: SensorGeometry | None = info.geometry
         self.towards_sensor: Float64Array | None = rig.part_from_sensor(0.0).rotate(np.array([0.0, 0.0, 1.0]))
         self.info = info
+        self.ports = (scanner.port_path,)
         self._scanner = scanner
         self._rig = rig
         self._request = request

@@ -216,31 +216,33 @@ def test_a_session_survives_kill_9_with_everything_that_was_acknowledged(running
     )
 
 
-@pytest.mark.parametrize(
-    ("source", "status", "told"),
-    [
+def test_a_source_that_cannot_be_used_is_refused_in_one_sentence(service, running):
+    simulator = running.simulator("plate")
+    before = service.client.get("/api/v1/sessions").json()["sessions"]
+    for source, status, told in (
         ({"port": "/dev/ttyUSB99"}, 404, "/dev/ttyUSB99"),
         ({"port": "/etc/passwd"}, 422, "not a serial device"),
         ({"port": "socket://127.0.0.1:1"}, 422, "not a serial device"),
         ({"line_spacing_mm": 0.0}, 422, "greater than 0"),
         ({"start_mm": 1.0, "end_mm": 1.0}, 422, "has no length"),
-    ],
-)
-def test_a_source_that_cannot_be_used_is_refused_in_one_sentence(service, running, source, status, told):
-    simulator = running.simulator("plate")
-    before = service.client.get("/api/v1/sessions").json()["sessions"]
-    answer = service.client.post("/api/v1/sessions", json={"source": device(simulator, **source)})
-    assert (answer.status_code, answer.headers["content-type"]) == (status, "application/problem+json")
-    assert told in answer.text
+    ):
+        answer = service.client.post("/api/v1/sessions", json={"source": device(simulator, **source)})
+        assert (answer.status_code, answer.headers["content-type"]) == (status, "application/problem+json")
+        assert told in answer.text
     assert service.client.get("/api/v1/sessions").json()["sessions"] == before
 
 
-def test_a_port_in_use_is_refused_by_name(service, running):
+def test_a_port_in_use_is_refused_by_the_session_that_holds_it_and_a_pass_that_cannot_be_lets_go_of_it(service, running):
     simulator = running.simulator("plate")
-    service.create(**device(simulator))
+    first = service.create(**device(simulator, end_mm=4000.0))  # only the scanner knows how far its stage goes
     answer = service.client.post("/api/v1/sessions", json={"source": device(simulator)})
     assert answer.status_code == 409
-    assert simulator.port in answer.json()["detail"]
+    assert f"{simulator.port} is held by session {first}" in answer.json()["detail"]
+    refused = service.client.post(f"/api/v1/sessions/{first}/start")
+    assert (refused.status_code, refused.json()["type"]) == (422, "/problems/pass-refused")
+    assert "check line spacing, travel and line rate" in refused.json()["detail"]
+    assert service.status(first)["state"] == "failed"
+    service.create(**device(simulator))
 
 
 def test_a_session_that_was_never_started_lets_go_of_its_port(service, running):

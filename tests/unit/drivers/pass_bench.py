@@ -131,6 +131,8 @@ class BenchStage:
 class BenchScanner:
     """One profile a look, from its start until it is stopped; `skipped` lines are made and never arrive."""
 
+    most_lines_per_s = math.inf
+
     def __init__(self, shop):
         self.shop = shop
         self.is_connected = True
@@ -158,7 +160,8 @@ class BenchScanner:
         self.laser_on = True
         return 1
 
-    def start_pass(self, *_order):
+    def start_pass(self, *order):
+        self.ordered = order
         return self.start_profiles()
 
     def stop_profiles(self):

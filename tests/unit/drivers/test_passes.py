@@ -2,13 +2,15 @@
 
 import contextlib
 import itertools
+import math
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from drivers.errors import StageStopped
+from drivers.errors import DriverError, StageStopped
 from drivers.passes.at_rest import run_at_rest
 from drivers.passes.in_motion import MotionPass
 from drivers.passes.stopping import Stopping
@@ -20,6 +22,8 @@ from drivers.rig_file import parse_rig
 from drivers.rig_limits import PassOrder
 from drivers.running_rig import RunningRig
 from drivers.scanline import Scanline
+from drivers.stages.setup import StageSetup
+from drivers.stages.unmoved import ConstantSpeed
 from scanner_service.sessions.rig_source import Preparation, RigSource
 from tests.unit.drivers.pass_bench import AT_REST, ORDER, BenchScanner, BenchStage, Workshop, bench
 
@@ -133,6 +137,48 @@ def test_counted_lines_keep_their_places_where_others_are_missing(skipped):
     truly_mm = 10.0 * (np.array([line.device_time_s for line in lines]) - set_off_s)
     assert np.abs(truly_mm - at_mm).max() <= drive.lines.report().largest_uncertainty_mm + 1e-6
     assert not [event for event in told if isinstance(event, Advice)]
+
+
+def on_a_conveyor(spacing_mm, by=PairBy.TIME):
+    """A pass of 20 lines a second over a conveyor of 10 mm/s: lines come half a millimetre apart."""
+    shop, _, scanner, drive = bench(PassOrder(0.0, 10.0, spacing_mm), by)
+    belt = ConstantSpeed(
+        StageSetup(None, None, speed_mm_per_s=(10.0, 10.0), options={"speed_tolerance": 0.0}, clock=shop.clock)
+    )
+    return scanner, replace(drive, stage=belt, driven=None)
+
+
+@pytest.mark.parametrize("by", [PairBy.TIME, PairBy.COUNT])
+def test_a_spacing_that_a_conveyor_cannot_give_is_refused_with_the_one_that_it_gives(by):
+    scanner, drive = on_a_conveyor(1e-4, by)
+    with pytest.raises(
+        DriverError, match=r"0\.0001 mm apart cannot be had: at 10 mm/s and 20 lines .* come 0\.5 mm apart"
+    ):
+        MotionPass(drive, scanner).run()
+    assert sum(isinstance(event, Scanline) for event in drive.told.take(0.0)) < 10
+
+
+@pytest.mark.parametrize(("spacing_mm", "is_told"), [(0.3, False), (0.5, False), (0.9, False), (1.5, True)])
+def test_lines_that_come_closer_than_ordered_are_taken_and_told_when_far_closer(spacing_mm, is_told):
+    scanner, drive = on_a_conveyor(spacing_mm)
+    MotionPass(drive, scanner).run()
+    told = drive.told.take(0.0)
+    assert sum(isinstance(event, Scanline) for event in told) >= 20
+    assert any(isinstance(event, Advice) and "come 0.5 mm apart" in event.text for event in told) is is_told
+
+
+@pytest.mark.parametrize(
+    ("speed", "rate_hz", "text"), [(math.nan, 38.0, "the pass goes at 19 mm/s"), (20.0, 40.0, "go at 19 mm/s or less")]
+)
+def test_a_wire_that_has_no_time_for_all_lines_slows_the_pass_down_or_is_told(speed, rate_hz, text):
+    _, _, scanner, drive = bench(PassOrder(0.0, 10.0, 0.5, speed))
+    drive.description.limits.line_rate_hz = (0.0, 1000.0)
+    scanner.most_lines_per_s = 40.0 - 1e-9
+    shop = scanner.shop
+    shop.at_look[20] = scanner.stop_pass
+    run_with_device(drive, scanner)
+    assert scanner.ordered[-1] == pytest.approx(rate_hz)
+    assert [event.text for event in drive.told.take(0.0) if isinstance(event, Advice) and text in event.text]
 
 
 def rig(makes_stage=BenchStage):

@@ -173,6 +173,24 @@ def test_limits_say_why_a_pass_cannot_be() -> None:
     assert limits.why_not(0.0, 300.0) is None
     assert limits.why_not(-1.0, 10.0) == "the start at -1 mm is outside the stage's travel of 0 to 300 mm"
     assert limits.why_not(0.0, math.nan) is not None
+
+
+@pytest.mark.parametrize(
+    ("rates", "speeds", "order", "said"),
+    [
+        ((0.0, math.inf), (50.0, 50.0), (1e-4, math.nan), None),  # nothing tells the line rate yet
+        ((5.0, 10.0), (50.0, 50.0), (1e-4, math.nan), "at least 5 mm apart: 50 mm/s at 10 lines a second"),
+        ((5.0, 10.0), (50.0, 50.0), (12.0, math.nan), "at most 10 mm apart: 50 mm/s at 5 lines a second"),
+        ((5.0, 10.0), (50.0, 50.0), (5.0, math.nan), None),
+        ((5.0, 10.0), (0.0, 50.0), (1e-4, math.nan), None),  # a stage may go as slowly as that
+        ((5.0, 10.0), (0.0, 50.0), (1e-4, 20.0), "at least 2 mm apart: 20 mm/s at 10 lines a second"),
+        ((5.0, 10.0), (0.0, 50.0), (1e-4, 0.0), None),  # at rest any spacing can be had
+    ],
+)
+def test_lines_come_as_far_apart_as_speeds_and_rates_let_them(rates, speeds, order, said) -> None:
+    limits = RigLimits(AxisKind.LINEAR, (0.0, 300.0), speeds, rates, None, (-50.0, 50.0))
+    why = limits.why_not_spaced(PassOrder(0.0, 100.0, *order))
+    assert (why is None) if said is None else (why is not None and why.endswith(said))
     with pytest.raises(ValueError, match="lowest, highest"):
         RigLimits(AxisKind.LINEAR, (1, 0), (0, 1), (0, 1), None, (0, 1))
     with pytest.raises(ValueError, match="radius"):
