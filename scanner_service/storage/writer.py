@@ -291,8 +291,21 @@ class Writer:
                 self._check_nobody_else_wrote(self._connection)
             except RecordUnusable as error:
                 raise StorageFault(str(error)) from error
-        with self._connection.begin():
-            yield self._connection
+        try:
+            with self._connection.begin():
+                yield self._connection
+        except BaseException:
+            self._leave_transaction()
+            raise
+
+    def _leave_transaction(self) -> None:
+        """After a COMMIT that failed SQLAlchemy believes the transaction over, while the database may be in it still."""
+        if self._connection is None or self._connection.invalidated:
+            return
+        try:
+            self._connection.connection.rollback()
+        except Exception:  # noqa: BLE001 - a connection that cannot even do this is thrown away
+            self._disconnect()
 
     def _check_nobody_else_wrote(self, connection: Connection) -> None:
         """While we were without a connection, and without its lock, another service may have taken the record over."""

@@ -191,6 +191,29 @@ def test_nothing_is_acknowledged_while_the_disk_fails_and_everything_is_once_it_
         assert (record.writer_state().state, record.writer_state().waiting_lines) == ("ok", 0)
 
 
+def test_after_a_failed_commit_the_next_attempt_begins_outside_of_any_transaction(tmp_path: Path) -> None:
+    plan, said = ["none"], []
+
+    class Noting(sqlite3.Cursor):
+        def execute(self, *arguments: Any) -> Any:
+            try:
+                return super().execute(*arguments)
+            except sqlite3.Error as error:
+                said.append(str(error))
+                raise
+
+    class Noted(faulty_disk(plan)):  # type: ignore[misc]
+        def cursor(self, factory: type[sqlite3.Cursor] = Noting) -> Any:
+            return super().cursor(factory)
+
+    with Record.open(tmp_path / "r", limits=FAST, connection_class=Noted) as record:
+        session = record.create_session("open").session_id
+        plan[:] = ["before"] * 3  # fewer than make the writer open a new connection
+        assert record.append(session, line_of(0)).result(timeout=60) == Stored(0, "stored")
+        assert record.writer_state().retries == 3
+    assert said == []
+
+
 def test_a_full_spool_refuses_counts_and_takes_no_more_than_its_bound(tmp_path: Path) -> None:
     plan = ["none"]
     limits = Limits(spool_bytes=20_000, first_retry_s=0.001, longest_retry_s=0.01)
