@@ -39,7 +39,6 @@ def export_command(
     """Write a session in other programs' formats, with a manifest of hashes; PLY when no format is named."""
     with plain_errors():
         wanted = [part for given in formats or ["ply"] for part in given.lower().split(",")]
-        wanted = list(FORMATS) if "all" in wanted else wanted
         check_formats(wanted)
         check_folder(out)
         with open_reader(data, record) as reader, work_progress("exporting", as_json) as progress:
@@ -47,6 +46,8 @@ def export_command(
             manifest = export_session(
                 reader, row, wanted, out, datetime.now(UTC), progress.show, points_at_once, meshes_in(data)
             )
+        for name, why in manifest["left_out"].items():
+            errors.print(f"not written: {name}: {why}", highlight=False, soft_wrap=True)
         for damaged in manifest["damaged_lines"]:
             errors.print(f"left out: {damaged}", highlight=False, soft_wrap=True)
         if manifest.get("reference_refused"):

@@ -65,11 +65,9 @@ def read_in_tiles(
     NotExportable : the radius is one for the whole cloud, which only the whole cloud can tell.
     """
     settings = SessionSettings.from_dict(row.settings)
-    if settings.radius_rule == "global":
-        raise NotExportable(
-            "the session has one radius for the whole cloud, which cannot be told from parts of it: "
-            f"allow more than {points_at_once} points at once"
-        )
+    refusal = why_not_in_tiles(settings, points_at_once)
+    if refusal is not None:
+        raise NotExportable(refusal)
     events = list(reader.events(row.session_id))
     withdrawn, scan_ends = withdrawn_passes(events), ends_of_passes(events)
     heads: list[_Head] = []
@@ -108,6 +106,16 @@ def read_in_tiles(
         blocks=blocks,
     )
     return TiledSession(stream, raw.hexdigest(), len(heads), tuple(damaged), len(slabs))
+
+
+def why_not_in_tiles(settings: SessionSettings, points_at_once: int) -> str | None:
+    """Why a session of more points cannot be told from parts, as one sentence; None when it can."""
+    if settings.radius_rule != "global":
+        return None
+    return (
+        "the session has one radius for the whole cloud, which cannot be told from parts of it: "
+        f"allow more than {points_at_once:,} points at once"
+    )
 
 
 def _head(number: int, line: StoredLine, settings: SessionSettings, after_an_end: bool) -> _Head:
