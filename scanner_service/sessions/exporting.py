@@ -7,11 +7,12 @@ from typing import Any
 
 from scanner_service import __version__
 from scanner_service.sessions.fingerprint import verdict_sha256
+from scanner_service.sessions.memory_bound import points_at_once as points_that_fit
 from scanner_service.sessions.outputs import stored_outcome, write_output
 from scanner_service.sessions.reporting import report_of
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.stored import StoredSession, about_of, read_session
-from scanner_service.sessions.tiles import POINTS_AT_ONCE, read_in_tiles, why_not_in_tiles
+from scanner_service.sessions.tiles import read_in_tiles, why_not_in_tiles
 from scanner_service.storage.exports.about import About
 from scanner_service.storage.exports.errors import ExtraMissing, FormatNotWritten, NotExportable
 from scanner_service.storage.exports.manifest import write_manifest
@@ -65,15 +66,16 @@ def export_session(
     folder: Path,
     now: datetime,
     on_progress: OnProgress = lambda what, share: None,
-    points_at_once: int = POINTS_AT_ONCE,
+    points_at_once: int | None = None,
     meshes: Path | None = None,
 ) -> dict[str, Any]:
     """Write a session in the formats asked for, and the manifest of the files; returns the manifest.
 
     Each file appears under its name when it is whole, the manifest last. `on_progress` is told what is being done,
-    and the share of it that is done. A session of more than `points_at_once` points is never in memory as a whole:
-    its points are written without a verdict, slab by slab. What `all` cannot write stands in the manifest under
-    `left_out`, with the reason. `meshes` is the folder with the reference mesh that the session may name.
+    and the share of it that is done. A session of more than `points_at_once` points (None: as many as fit into half
+    of the free memory, at most ten million) is never in memory as a whole: its points are written without a verdict,
+    slab by slab. What `all` cannot write stands in the manifest under `left_out`, with the reason. `meshes` is the
+    folder with the reference mesh that the session may name.
 
     Raises
     ------
@@ -81,6 +83,7 @@ def export_session(
     RecordError : the record cannot be read.
     """
     check_formats(formats)
+    points_at_once = points_that_fit() if points_at_once is None else points_at_once
     points = reader.count(row.session_id).points
     impossible = {name: why for name in FORMATS if (why := _why_not(name, row, points, points_at_once)) is not None}
     for name in formats:
@@ -132,7 +135,7 @@ def _why_not(name: str, row: SessionRow, points: int, points_at_once: int) -> st
     if name in (RESULTS, REPORT):
         return (
             f"regions and coverage need all {points:,} points of the session in memory, and {points_at_once:,} at once "
-            "are allowed: leave out results and report, or allow more"
+            "are allowed: leave out results and report, or allow more memory"
         )
     return why_not_in_tiles(SessionSettings.from_dict(row.settings), points_at_once)
 

@@ -130,7 +130,11 @@ def _facts(summary: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
 
 
 def _losses(losses: Mapping[str, Any]) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:
-    names = {"lines": "Lines, as they came in", "points": "Places in the lines", "device": "Scanner and wire, all passes"}
+    names = {
+        "lines": "Lines, as they came in",
+        "points": "Places in the lines",
+        "device": "Scanner and wire, all passes",
+    }
     groups = []
     for key, value in losses.items():
         if isinstance(value, Mapping):

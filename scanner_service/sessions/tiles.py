@@ -25,7 +25,6 @@ from scanner_service.storage.exports.point_stream import BLOCK_POINTS, Int64Arra
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.rows import SessionRow
 
-POINTS_AT_ONCE = 10_000_000
 _SLAB_POINTS = 4_000_000
 _BIN_Q = 1 << 13  # a slab ends at a whole millimetre
 _NO_XYZ, _NO_INDEX = np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
