@@ -156,8 +156,8 @@ def _rows_of_passes(passes: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, 
 
 
 def _rows_of_pass(name: str, lines: Mapping[str, Any], chunks: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
-    more = [f"{shown(lines[what])} {said}" for what, said in (("partial", "of them partial"), ("under_way", "under way"),
-                                                              ("duplicates", "came twice")) if lines[what]]  # fmt: skip
+    words = {"partial": "of them partial", "under_way": "under way", "duplicates": "came twice"}
+    more = [f"{shown(lines[what])} {said}" for what, said in words.items() if lines[what]]
     yield name, _balance(lines, more)
     if chunks is not None:
         yield f"{name}, chunks", _balance(chunks, [])

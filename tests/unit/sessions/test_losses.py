@@ -62,7 +62,7 @@ class RestlessWire:
             if not is_lost:
                 self._account.chunk(number, number, 0, 0)
                 self._account.line_closed(whole=True)
-                self._sink.line(scanline(ROW_MM + [0.0, 0.2 * number, 0.0], number, boot_id=self.boot_id))
+                self._sink.line(scanline(ROW_MM + np.array([0, 0.2 * number, 0]), number, boot_id=self.boot_id))
                 self._delivered += 1
         while self._sink.engine.ledger.snapshot().received < self._delivered:  # until the session has heard of all
             time.sleep(0.001)
