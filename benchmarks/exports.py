@@ -1,6 +1,6 @@
 """Exports measured: seconds, size and peak memory of each format, each in a process of its own.
 
-    python -m benchmarks.exports [--points 5000000] [--formats ply,laz] [--points-at-once N] [--json FILE]
+    python -m benchmarks.exports [--points 5000000] [--formats ply,laz] [--memory-mb N] [--json FILE]
 
 Each figure holds the start of the program and the rebuilding of the session, which every export takes first.
 """
@@ -93,10 +93,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=5_000_000)
     parser.add_argument("--formats", default=",".join(FORMATS))
-    parser.add_argument("--points-at-once", type=int)
+    parser.add_argument("--memory-mb", type=int, help="as `scanner export` takes it")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
-    more = [] if asked.points_at_once is None else ["--points-at-once", str(asked.points_at_once)]
+    more = [] if asked.memory_mb is None else ["--memory-mb", str(asked.memory_mb)]
     rows = []
     with tempfile.TemporaryDirectory(prefix="scanner-exports-") as folder:
         record = Path(folder) / "record.sqlite"

@@ -18,8 +18,8 @@ from scanner_service.commands.terminal import (
     work_progress,
 )
 from scanner_service.sessions.exporting import FORMATS, check_formats, export_session
+from scanner_service.sessions.memory_bound import points_at_once as points_that_fit
 from scanner_service.sessions.stored import find_session
-from scanner_service.sessions.tiles import POINTS_AT_ONCE
 from scanner_service.storage.exports.manifest import MANIFEST, verify_folder
 
 
@@ -31,22 +31,30 @@ def export_command(
     out: Annotated[Path, typer.Option(help="Folder for the files and their manifest.")] = Path("out"),
     data: Data = DEFAULT_DATA,
     record: RecordFile = None,
+    memory_mb: Annotated[
+        int | None,
+        typer.Option(min=1, help="Memory to use; a session that needs more is written in slabs, without regions."),
+    ] = None,
     points_at_once: Annotated[
-        int, typer.Option(min=1, help="A session of more points is written in slabs, without regions.")
-    ] = POINTS_AT_ONCE,
+        int | None, typer.Option(min=1, help="The same as a number of points that are held at once.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the manifest as JSON.")] = False,
 ) -> None:
     """Write a session in other programs' formats, with a manifest of hashes; PLY when no format is named."""
     with plain_errors():
         wanted = [part for given in formats or ["ply"] for part in given.lower().split(",")]
-        wanted = list(FORMATS) if "all" in wanted else wanted
+        if memory_mb is not None and points_at_once is not None:
+            raise ValueError("--memory-mb and --points-at-once say the same: leave one of them out")
+        bound = points_at_once if memory_mb is None else points_that_fit(memory_mb << 20)
         check_formats(wanted)
         check_folder(out)
         with open_reader(data, record) as reader, work_progress("exporting", as_json) as progress:
             row = find_session(reader, session)
             manifest = export_session(
-                reader, row, wanted, out, datetime.now(UTC), progress.show, points_at_once, meshes_in(data)
+                reader, row, wanted, out, datetime.now(UTC), progress.show, bound, meshes_in(data)
             )
+        for name, why in manifest["left_out"].items():
+            errors.print(f"not written: {name}: {why}", highlight=False, soft_wrap=True)
         for damaged in manifest["damaged_lines"]:
             errors.print(f"left out: {damaged}", highlight=False, soft_wrap=True)
         if manifest.get("reference_refused"):

@@ -330,11 +330,12 @@ class SessionBook:
             self._live = {}
 
     def _make_room(self) -> None:
-        """Close the session that was opened first among those that do not scan."""
+        """Close the session that was opened first among those that do not scan, nor will by themselves."""
         if len(self._live) + len(self._opening) < MAX_LIVE:
             return
         for session_id, session in self._live.items():
-            if session.state in OVER:
+            _, desk = self._desks.get(session_id, (session, None))
+            if session.state in OVER and not (desk is not None and desk.is_looping):
                 session.close()
                 del self._live[session_id]
                 self._desks.pop(session_id, None)

@@ -21,6 +21,7 @@ from scanner_service.analysis.live_map import LiveMap, MapSettings
 from scanner_service.analysis.passes import PassKey, pass_key
 from scanner_service.sessions.errors import LineRefused, SessionNotLive
 from scanner_service.sessions.ledger import Ledger
+from scanner_service.storage.answer import Answer
 from scanner_service.storage.errors import RecordBusy, RecordError
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import Stored
@@ -227,7 +228,7 @@ class Engine:
         if message.reply is not None:
             message.reply.set_exception(LineRefused(reason, text))
 
-    def _committed(self, done: "Future[Stored]", line: StoredLine, reply: "Future[Stored] | None") -> None:
+    def _committed(self, done: Answer[Stored], line: StoredLine, reply: "Future[Stored] | None") -> None:
         """On the record's writer: the line is durable, or will never be."""
         error = done.exception()
         outcome = done.result().outcome if error is None else "not_stored"

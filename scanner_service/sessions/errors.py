@@ -6,6 +6,8 @@ SessionError
 ├── PassUnknown         no such recommended or accepted pass
 ├── BudgetSpent         the disk budget is used up, and no session may be deleted to make room
 ├── SourceUnusable      what the session should read from cannot be read
+├── FileUnknown         no file of that name lies in the replay folder
+├── NameTaken           another file has that name
 ├── LineRefused         one scanline was not taken in, for the reason told
 ├── AnalysisUnknown     there is no analysis of that id, or its room was needed
 ├── AnalysisNotDone     the analysis has no result: it waits, runs or has failed
@@ -35,6 +37,14 @@ class BudgetSpent(SessionError):
 
 class SourceUnusable(SessionError):
     """What the session should read from cannot be read."""
+
+
+class FileUnknown(SessionError):
+    """No file of that name lies in the replay folder."""
+
+
+class NameTaken(SessionError):
+    """Another file has that name."""
 
 
 class LineRefused(SessionError):

@@ -7,10 +7,12 @@ from typing import Any
 
 from scanner_service import __version__
 from scanner_service.sessions.fingerprint import verdict_sha256
+from scanner_service.sessions.memory_bound import points_at_once as points_that_fit
 from scanner_service.sessions.outputs import stored_outcome, write_output
 from scanner_service.sessions.reporting import report_of
+from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.stored import StoredSession, about_of, read_session
-from scanner_service.sessions.tiles import POINTS_AT_ONCE, read_in_tiles
+from scanner_service.sessions.tiles import read_in_tiles, why_not_in_tiles
 from scanner_service.storage.exports.about import About
 from scanner_service.storage.exports.errors import ExtraMissing, FormatNotWritten, NotExportable
 from scanner_service.storage.exports.manifest import write_manifest
@@ -28,6 +30,9 @@ RESULT_FILES = ("density.png", "regions.json", "summary.json")
 REPORT_FILES = ("report.html", "report.pdf")
 RESULTS, RECORD, REPORT = "results", "record", "report"
 FORMATS = (*POINT_FORMATS, RESULTS, RECORD, REPORT)
+ALL = "all"
+"""Stands for every format that can be written; what cannot is told in the manifest, with the reason."""
+
 OnProgress = Callable[[str, float], object]
 
 
@@ -42,8 +47,8 @@ def check_formats(formats: Sequence[str]) -> None:
     if not formats:
         raise FormatNotWritten(f"no format to export was named; the formats are {', '.join(FORMATS)}")
     for name in formats:
-        if name not in FORMATS:
-            raise FormatNotWritten(f"there is no export format {name}; the formats are {', '.join(FORMATS)}")
+        if name not in (*FORMATS, ALL):
+            raise FormatNotWritten(f"there is no export format {name}; the formats are {', '.join(FORMATS)}, or {ALL}")
         missing = missing_for(name)
         if missing is not None:
             raise ExtraMissing(missing)
@@ -61,15 +66,16 @@ def export_session(
     folder: Path,
     now: datetime,
     on_progress: OnProgress = lambda what, share: None,
-    points_at_once: int = POINTS_AT_ONCE,
+    points_at_once: int | None = None,
     meshes: Path | None = None,
 ) -> dict[str, Any]:
     """Write a session in the formats asked for, and the manifest of the files; returns the manifest.
 
     Each file appears under its name when it is whole, the manifest last. `on_progress` is told what is being done,
-    and the share of it that is done. A session of more than `points_at_once` points is never in memory as a whole:
-    its points are written without a verdict, slab by slab. `meshes` is the folder with
-    the reference mesh that the session may name.
+    and the share of it that is done. A session of more than `points_at_once` points (None: as many as fit into half
+    of the free memory, at most ten million) is never in memory as a whole: its points are written without a verdict,
+    slab by slab. What `all` cannot write stands in the manifest under `left_out`, with the reason. `meshes` is the
+    folder with the reference mesh that the session may name.
 
     Raises
     ------
@@ -77,13 +83,14 @@ def export_session(
     RecordError : the record cannot be read.
     """
     check_formats(formats)
-    wanted = [name for name in FORMATS if name in formats]
+    points_at_once = points_that_fit() if points_at_once is None else points_at_once
     points = reader.count(row.session_id).points
-    if points > points_at_once and {RESULTS, REPORT} & set(wanted):
-        raise NotExportable(
-            f"regions and coverage need all {points} points of the session in memory, and {points_at_once} at once are "
-            "allowed: leave out results and report, or allow more"
-        )
+    impossible = {name: why for name in FORMATS if (why := _why_not(name, row, points, points_at_once)) is not None}
+    for name in formats:
+        if name in impossible:
+            raise NotExportable(impossible[name])
+    left_out = impossible if ALL in formats else {}
+    wanted = [name for name in FORMATS if name in formats or (ALL in formats and name not in left_out)]
     folder.mkdir(parents=True, exist_ok=True)
     written: list[str] = []
     if points > points_at_once:
@@ -95,7 +102,8 @@ def export_session(
             else:
                 written += _write_points(name, tiled.stream, about, folder, on_progress)
         facts = {"lines": tiled.lines, "points": tiled.stream.total, "damaged_lines": list(tiled.damaged)}
-        return write_manifest(folder, written, _facts(about, now) | facts | {"verdict_sha256": None})
+        facts |= {"left_out": left_out, "verdict_sha256": None}
+        return write_manifest(folder, written, _facts(about, now) | facts)
     stored = read_session(reader, row, lambda share: on_progress("reading the record", share), REPORT in wanted, meshes)
     results = stored.results
     stream = stream_of(results.snapshot, results.verdict.rescan, results.verdict.reason)
@@ -112,10 +120,24 @@ def export_session(
         "lines": stored.lines,
         "points": len(results.snapshot),
         "damaged_lines": list(stored.damaged),
+        "left_out": left_out,
         "reference_refused": results.reference_refused,
         "verdict_sha256": verdict_sha256(results),
     }
     return write_manifest(folder, written, _facts(stored.about, now) | facts)
+
+
+def _why_not(name: str, row: SessionRow, points: int, points_at_once: int) -> str | None:
+    """Why a format cannot be written of a session, as one sentence; None when it can."""
+    missing = missing_for(name)
+    if missing is not None or name == RECORD or points <= points_at_once:
+        return missing
+    if name in (RESULTS, REPORT):
+        return (
+            f"regions and coverage need all {points:,} points of the session in memory, and {points_at_once:,} at once "
+            "are allowed: leave out results and report, or allow more memory"
+        )
+    return why_not_in_tiles(SessionSettings.from_dict(row.settings), points_at_once)
 
 
 def _write_points(name: str, stream: PointStream, about: About, folder: Path, on_progress: OnProgress) -> list[str]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
-from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SourceUnusable
+from scanner_service.sessions.errors import BudgetSpent, FileUnknown, NameTaken, SessionBusy, SourceUnusable
 from scanner_service.storage.errors import RecordError
 from scanner_service.storage.formats import FormatError, kind_of_content
 from scanner_service.storage.reader import RecordReader
@@ -100,9 +100,9 @@ class FileShelf:
             raise BudgetSpent(f"the disk of the service is too full for it: {RESERVE_BYTES >> 20} MiB stay free")
 
     def remove(self, name: str) -> None:
-        """Remove a file; sessions that were made from it stay. Raises SourceUnusable when it is not there."""
+        """Remove a file; sessions that were made from it stay. Raises FileUnknown when it is not there."""
         if name not in {one.name for one in self.files()}:
-            raise SourceUnusable(f"there is no file {name} in the service's replay folder")
+            raise FileUnknown(f"there is no file {name} in the service's replay folder")
         for beside in ("", *_BESIDE):
             (self.folder / (name + beside)).unlink(missing_ok=True)
 
@@ -141,7 +141,8 @@ class Arrival:
 
         Raises
         ------
-        SourceUnusable : another file of that name is there, or it is a record that cannot be read.
+        NameTaken : another file of that name is there.
+        SourceUnusable : it is a record that cannot be read.
         FormatError : it is nothing that is read here.
         """
         self._file.flush()
@@ -155,7 +156,7 @@ class Arrival:
             os.link(self._beside, place)  # unlike a rename it replaces nothing
         except FileExistsError:
             if not self._is_same(place):
-                raise SourceUnusable(
+                raise NameTaken(
                     f"another file {self._name} is there already: send this one under another name"
                 ) from None
         return ShelfFile(self._name, self._size_bytes, kind)

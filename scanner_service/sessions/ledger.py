@@ -138,7 +138,7 @@ class Ledger:
     def to_dict(
         self, device: Mapping[str, Any] | None = None, wire: Mapping[PassKey, PassTally] | None = None
     ) -> dict[str, Any]:
-        """As the API, the summary and the viewer show it; `device` is the driver's own tally of chunks and lines."""
+        """As the API, the summary and the viewer show it; `device` is the drivers' own sum of chunks and lines."""
         passes = [account.to_dict(key) for key, account in self.passes(wire).items()]
         with self._lock:
             return {

@@ -147,7 +147,7 @@ class PassDesk:
         """Plan and carry out by itself until nothing is left to do; raises SessionBusy while a loop runs."""
         self.plan(limits.serving)  # what cannot be planned is refused now, not in the loop
         with self._lock:
-            if self.loop is not None and self.loop.running:
+            if self.is_looping:
                 raise SessionBusy("a closed loop is running already: end it first")
             by_client = isinstance(self._session.source, PushSource) and self._setup_now().driven_by_client
             if not (by_client or is_driven(self._session)):
@@ -163,6 +163,11 @@ class PassDesk:
             daemon=True,
         ).start()
         return loop
+
+    @property
+    def is_looping(self) -> bool:
+        """True while a closed loop runs, between two of its passes too."""
+        return self.loop is not None and self.loop.running
 
     def end_loop(self) -> None:
         """End the closed loop after the pass that is under way."""

@@ -1,9 +1,10 @@
 """What the report of a session says: gathers it from the rebuilt session; draws and lays out nothing."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.results import Results, summarise
 from scanner_service.sessions.stored import Stage, StoredSession
+from scanner_service.sessions.wires import joined
 from scanner_service.storage.exports.report_content import (
     FateRow,
     PassRow,
@@ -128,13 +130,43 @@ def _facts(summary: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
 
 
 def _losses(losses: Mapping[str, Any]) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:
-    names = {"lines": "Lines, as they came in", "points": "Places in the lines", "device": "Scanner and wire"}
+    names = {
+        "lines": "Lines, as they came in",
+        "points": "Places in the lines",
+        "device": "Scanner and wire, all passes",
+    }
     groups = []
     for key, value in losses.items():
         if isinstance(value, Mapping):
             rows = flat_rows({name: value[name] for name in sorted(value, key=_in_order)})
             groups.append((names.get(key, key.replace("_", " ")), tuple(rows)))
+    passes = losses.get("passes") or ()
+    if passes:
+        groups.append(("Scanlines of each pass, from the scanner to the record", tuple(_rows_of_passes(passes))))
     return tuple(groups)
+
+
+def _rows_of_passes(passes: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
+    """Lines, and chunks where there are any, of each pass, then of all of them."""
+    for told in passes:
+        yield from _rows_of_pass(f"{told['device_id']} pass {told['pass_index']}", told["lines"], told["chunks"])
+    if len(passes) > 1:
+        lines, chunks = (reduce(joined, [told[of] for told in passes]) for of in ("lines", "chunks"))
+        yield from _rows_of_pass("all passes", lines, chunks)
+
+
+def _rows_of_pass(name: str, lines: Mapping[str, Any], chunks: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
+    words = {"partial": "of them partial", "under_way": "under way", "duplicates": "came twice"}
+    more = [f"{shown(lines[what])} {said}" for what, said in words.items() if lines[what]]
+    yield name, _balance(lines, more)
+    if chunks is not None:
+        yield f"{name}, chunks", _balance(chunks, [])
+
+
+def _balance(account: Mapping[str, Any], more: list[str]) -> str:
+    lost = [f"{shown(count)} {reason.replace('_', ' ')}" for reason, count in account["lost"].items() if count]
+    parts = [f"{shown(account['sent'])} sent, {shown(account['stored'])} stored", *more]
+    return ", ".join(parts) + "; lost: " + (", ".join(lost) or "none")
 
 
 def _in_order(name: str) -> tuple[int, str]:

@@ -4,7 +4,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import Any
 
@@ -12,7 +12,6 @@ import numpy as np
 
 from drivers.errors import PassRefused
 from drivers.scanline import Scanline
-from drivers.tally import PassTally
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey
 from scanner_service.rescan.region import RegionStatus
@@ -28,9 +27,10 @@ from scanner_service.sessions.reopening import take_in
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.scan_clock import ScanClock
 from scanner_service.sessions.settings import SessionSettings
-from scanner_service.sessions.sources import OnAWire, Pausable, PushSource, ReplaySource, Source, SpentSource
+from scanner_service.sessions.sources import Pausable, PushSource, ReplaySource, Source
 from scanner_service.sessions.status import Status
 from scanner_service.sessions.updates import Changes, PointPage, VerdictBook, changes_since, read_page
+from scanner_service.sessions.wires import Wires
 from scanner_service.sessions.withdrawals import SCAN_ENDED, WITHDRAWN
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import EventRow, SessionRow, Stored
@@ -71,7 +71,7 @@ class LiveSession:
         self._held = False
         self._closing = threading.Event()
         self._is_closing = False
-        self._wires: tuple[Mapping[PassKey, PassTally], Source] = ({}, source)  # accounts of what was, and what is
+        self._wires = Wires(source)
         self._analyst = threading.Thread(target=self._analyse, name=f"analyst-{row.session_id}", daemon=True)
 
     @property
@@ -93,8 +93,7 @@ class LiveSession:
         if reopened.kept is not None:
             self._chronicle.kept(reopened.kept)
             self._time.go_on_from(float(reopened.kept.get("elapsed_s") or 0.0))
-            if isinstance(self.source, SpentSource):
-                self.source.remember(reopened.kept.get("device"))
+            self._wires = Wires(self.source, earlier_account=reopened.kept.get("device"))
         self._message = reopened.message
         if reopened.ended_since or self._state in ("stopped", "failed", "interrupted"):
             self.engine.close_passes()
@@ -156,9 +155,8 @@ class LiveSession:
             ):
                 source.towards_sensor = None  # the passes look from several sides: each is judged by its own rays
             before = self._wires
-            told = known.pass_tallies() if isinstance(known, OnAWire) else {}
             self.source, self._state = source, "scanning"
-            self._wires = (_joined(before[0], told), source)
+            self._wires = before.followed_by(source)
             self._time.start()
             try:  # what the pass is judged by is in the record before any line of it
                 self.event(CALIBRATED, calibration_of(source))
@@ -365,11 +363,10 @@ class LiveSession:
         return self._time.elapsed_s()
 
     def losses(self) -> dict[str, Any]:
-        """The whole ledger: lines, points, each pass, and what the driver of the latest source counted on the wire."""
-        ledger = self.engine.ledger.snapshot()  # before the wire's accounts: see there
-        earlier, source = self._wires
-        wire = _joined(earlier, source.pass_tallies() if isinstance(source, OnAWire) else {})
-        return ledger.to_dict(source.tally(), wire)
+        """The whole ledger: lines, points, each pass, and the sum of what the drivers of all passes counted."""
+        ledger = self.engine.ledger.snapshot()  # before the wires' accounts: see there
+        wires = self._wires
+        return ledger.to_dict(wires.account(), wires.passes())
 
     def status(self) -> Status:
         """What the session is doing now."""
@@ -459,8 +456,3 @@ class LiveSession:
     def _set_state(self, state: str) -> None:
         self._state = state
         self._chronicle.state(state)
-
-
-def _joined(a: Mapping[PassKey, PassTally], b: Mapping[PassKey, PassTally]) -> dict[PassKey, PassTally]:
-    """The accounts of both, those of the same pass added."""
-    return {**a, **{key: a[key] + told if key in a else told for key, told in b.items()}}

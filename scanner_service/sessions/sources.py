@@ -382,11 +382,6 @@ class SpentSource:
     ) -> None:
         self.geometry = geometry
         self.towards_sensor = towards_sensor
-        self._told: dict[str, Any] | None = None
-
-    def remember(self, told: dict[str, Any] | None) -> None:
-        """Tell from now on what the driver had counted."""
-        self._told = told
 
     def start(self, sink: Sink) -> None:
         """Cannot be started again."""
@@ -396,8 +391,8 @@ class SpentSource:
         """Nothing to let go of."""
 
     def tally(self) -> dict[str, Any] | None:
-        """What the driver had counted."""
-        return self._told
+        """There is no wire any more; what the driver had counted is in the record."""
+        return None
 
     def progress(self) -> float | None:
         """Everything that was stored is there."""

@@ -25,7 +25,6 @@ from scanner_service.storage.exports.point_stream import BLOCK_POINTS, Int64Arra
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.rows import SessionRow
 
-POINTS_AT_ONCE = 10_000_000
 _SLAB_POINTS = 4_000_000
 _BIN_Q = 1 << 13  # a slab ends at a whole millimetre
 _NO_XYZ, _NO_INDEX = np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
@@ -65,11 +64,9 @@ def read_in_tiles(
     NotExportable : the radius is one for the whole cloud, which only the whole cloud can tell.
     """
     settings = SessionSettings.from_dict(row.settings)
-    if settings.radius_rule == "global":
-        raise NotExportable(
-            "the session has one radius for the whole cloud, which cannot be told from parts of it: "
-            f"allow more than {points_at_once} points at once"
-        )
+    refusal = why_not_in_tiles(settings, points_at_once)
+    if refusal is not None:
+        raise NotExportable(refusal)
     events = list(reader.events(row.session_id))
     withdrawn, scan_ends = withdrawn_passes(events), ends_of_passes(events)
     heads: list[_Head] = []
@@ -108,6 +105,16 @@ def read_in_tiles(
         blocks=blocks,
     )
     return TiledSession(stream, raw.hexdigest(), len(heads), tuple(damaged), len(slabs))
+
+
+def why_not_in_tiles(settings: SessionSettings, points_at_once: int) -> str | None:
+    """Why a session of more points cannot be told from parts, as one sentence; None when it can."""
+    if settings.radius_rule != "global":
+        return None
+    return (
+        "the session has one radius for the whole cloud, which cannot be told from parts of it: "
+        f"allow more than {points_at_once:,} points at once"
+    )
 
 
 def _head(number: int, line: StoredLine, settings: SessionSettings, after_an_end: bool) -> _Head:

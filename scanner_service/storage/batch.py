@@ -6,10 +6,9 @@ Every method looks before it writes: a `RecordError` from it has changed nothing
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from itertools import chain
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import Connection, Dialect, Table, delete, func, insert, select, update
 
@@ -18,11 +17,12 @@ from scanner_service.storage.encoding import decode_line, encode_line
 from scanner_service.storage.errors import CreationKeyReused, LineDamaged, SessionDamaged, SessionUnknown
 from scanner_service.storage.rows import CreationKey, EventRow, SessionRow, Stored
 from scanner_service.storage.tables import (
+    LINE_COLUMNS,
     creations,
     events,
     from_json,
     ledgers,
-    line_crc,
+    line_row,
     lines,
     notes,
     plain_text,
@@ -34,11 +34,10 @@ from scanner_service.storage.tables import (
 from scanner_service.storage.tail import Tail, load_tail
 
 DELETE_SLICE_LINES = 256
-_ROWS_A_STATEMENT = 16
+_ROWS_A_STATEMENT = (128, 32, 8, 1)
 
 
-@dataclass(frozen=True, slots=True)
-class EncodedLine:
+class EncodedLine(NamedTuple):
     """A line ready to be stored, made in the thread of the caller."""
 
     device_id: str
@@ -63,7 +62,7 @@ class Batch:
     def __init__(self, connection: Connection, known: Mapping[str, Tail]) -> None:
         self._connection = connection
         self._known = known
-        self._rows: list[dict[str, Any]] = []
+        self._rows: list[tuple[Any, ...]] = []
         self.tails: dict[str, Tail] = {}
         self.deleted: set[str] = set()
 
@@ -75,19 +74,20 @@ class Batch:
             found = self._find(session_id, line)
             if found is not None:
                 return found
-        row: dict[str, Any] = {
-            "session_id": session_id,
-            "line_number": tail.next_line,
-            "device_id": line.device_id,
-            "boot_id": line.boot_id,
-            "line_index": line.line_index,
-            "pass_index": line.pass_index,
-            "points": line.points,
-            "points_before": tail.points,
-        }
-        row["crc32"] = line_crc(row, line.encoded_crc32)
-        row["encoded"] = line.encoded
-        self._rows.append(row)
+        self._rows.append(
+            line_row(
+                session_id,
+                tail.next_line,
+                line.device_id,
+                line.boot_id,
+                line.line_index,
+                line.pass_index,
+                line.points,
+                tail.points,
+                line.encoded,
+                line.encoded_crc32,
+            )
+        )
         tail.advance(line.device_id, line.boot_id, line.line_index, line.points)
         return Stored(tail.next_line - 1, "stored")
 
@@ -191,19 +191,17 @@ class Batch:
         return True
 
     def finish(self) -> None:
-        """Write the lines of the batch in one statement."""
-        if self._rows:
-            insertion, rows, self._rows = _line_insert(self._connection.dialect), self._rows, []
-            if insertion.order is None:
-                self._connection.exec_driver_sql(insertion.one, rows)
-                return
-            values = [tuple(map(row.__getitem__, insertion.order)) for row in rows]
-            whole = len(values) - len(values) % _ROWS_A_STATEMENT
-            for first in range(0, whole, _ROWS_A_STATEMENT):
-                many = tuple(chain.from_iterable(values[first : first + _ROWS_A_STATEMENT]))
-                self._connection.exec_driver_sql(insertion.many, many)
-            if whole < len(values):
-                self._connection.exec_driver_sql(insertion.one, values[whole:])
+        """Write the lines of the batch, in as few statements as they fill."""
+        rows, self._rows, done = self._rows, [], 0
+        if rows and not self._connection.dialect.positional:
+            named = [dict(zip(LINE_COLUMNS, row, strict=True)) for row in rows]
+            self._connection.execute(insert(lines), named)
+            return
+        while done < len(rows):
+            count = next(size for size in _ROWS_A_STATEMENT if size <= len(rows) - done)
+            values = tuple(chain.from_iterable(rows[done : done + count]))
+            self._connection.exec_driver_sql(_line_insert(self._connection.dialect, count), values)
+            done += count
 
     def _find(self, session_id: str, line: EncodedLine) -> Stored | None:
         """The answer for a line whose key is taken, None when it is free."""
@@ -319,28 +317,15 @@ def session_made_with(connection: Connection, key: CreationKey) -> SessionRow | 
     return session_from(dict(row))
 
 
-@dataclass(frozen=True, slots=True)
-class _Insertion:
-    """Statements for the driver itself: of one line, and of _ROWS_A_STATEMENT where values go by their `order`."""
-
-    one: str
-    many: str
-    order: tuple[str, ...] | None
-
-
 @cache
-def _line_insert(dialect: Dialect) -> _Insertion:
-    """How lines are inserted.
+def _line_insert(dialect: Dialect, count: int) -> str:
+    """The statement for the driver itself that inserts so many lines, values in the order of LINE_COLUMNS.
 
     Every scanline goes through it. SQLAlchemy would ask a third of what SQLite itself does, and SQLite's module gives
-    the interpreter away with each row, and has to wait for it.
+    the interpreter away with each statement, and has to wait for it.
     """
-    compiled = insert(lines).compile(dialect=dialect)
-    one, order = str(compiled), getattr(compiled, "positiontup", None)
-    if order is None:
-        return _Insertion(one, "", None)
-    head, values, row = one.rpartition("VALUES ")
-    return _Insertion(one, head + values + ", ".join([row] * _ROWS_A_STATEMENT), tuple(order))
+    head, values, row = str(insert(lines).compile(dialect=dialect)).rpartition("VALUES ")
+    return head + values + ", ".join([row] * count)
 
 
 def _notes_row(session_id: str, text: str, calibration: Mapping[str, Any]) -> dict[str, Any]:

@@ -89,54 +89,73 @@ def _is_one_run(index):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)  # a few microseconds: giving the interpreter away for them costs more
 def _pack(xyz_q, room):  # type: ignore[no-untyped-def]
-    """Fill `room` (uint8); returns how many bytes were used."""
+    """Fill `room` (uint8); returns how many bytes were used. Loops are plain, so that they run on several at once."""
     count = xyz_q.shape[0]
+    steps = np.empty(count - 1, dtype=np.int32)
     used = 3 * _HEAD_BYTES
     nothing_yet = True
     for column in range(3):
-        low, high, far = 32768, -32769, 0
-        for row in range(1, count):
-            step = _step(xyz_q, row, column)
-            if step < -32768 or step > 32767:
-                far += 1
-            else:
-                low, high = min(low, step), max(high, step)
+        for row in range(count - 1):
+            steps[row] = xyz_q[row + 1, column] - xyz_q[row, column]
+        low = high = steps[0] if count > 1 else np.int32(0)
+        for row in range(count - 1):
+            low, high = min(low, steps[row]), max(high, steps[row])
+        far = 0
+        if low < -32768 or high > 32767:
+            low, high, far = _near(steps)
         if 8 * far > count or far > _MOST_FAR:
-            width, smallest, far = 4, 0, 0
+            width, smallest, far = 4, np.int32(0), 0
         else:
-            smallest = low if low <= high else 0
-            span = high - low
-            width = 0 if span <= 0 else 1 if span < 256 else 2
+            smallest = low
+            span = np.int64(high) - np.int64(low)
+            width = 0 if span == 0 else 1 if span < 256 else 2
             if column == 2 and nothing_yet and width == 0:
                 width = 1  # so that the bytes bound how many points there are
         nothing_yet = nothing_yet and width == 0
         head = column * _HEAD_BYTES
-        _put(room, head, np.int64(xyz_q[0, column]), 4)
+        _put(room, head, xyz_q[0, column], 4)
         _put(room, head + 4, smallest, 4)
         room[head + 8] = width
         room[head + 9] = 0
         _put(room, head + 10, far, 2)
-        beside, used = used, used + 8 * far
-        for row in range(1, count):
-            step = _step(xyz_q, row, column)
-            if width < 4 and (step < -32768 or step > 32767):
-                _put(room, beside, row - 1, 4)
-                _put(room, beside + 4, step, 4)
-                beside += 8
-                step = smallest
-            _put(room, used, step - smallest, width)
-            used += width
+        for row in range(count - 1 if far else 0):
+            if steps[row] < -32768 or steps[row] > 32767:
+                _put(room, used, row, 4)
+                _put(room, used + 4, steps[row], 4)
+                used += 8
+                steps[row] = smallest
+        place = room[used : used + width * (count - 1)]
+        used += len(place)
+        if width == 1:
+            for row in range(count - 1):
+                place[row] = np.uint8(steps[row] - smallest)
+        elif width == 2:
+            for row in range(count - 1):
+                step = np.uint16(steps[row] - smallest)
+                place[2 * row] = np.uint8(step)
+                place[2 * row + 1] = np.uint8(step >> 8)
+        elif width == 4:
+            for row in range(count - 1):
+                _put(place, 4 * row, steps[row], 4)
     return used
 
 
-@njit(cache=True, inline="always")
-def _step(xyz_q, row, column):  # type: ignore[no-untyped-def]
-    """From one point to the next, as a 32-bit integer has it."""
-    step = np.int64(xyz_q[row, column]) - np.int64(xyz_q[row - 1, column])
-    return ((step + 2147483648) & 4294967295) - 2147483648
+@njit(cache=True)
+def _near(steps):  # type: ignore[no-untyped-def]
+    """The smallest and the largest of the steps that are not far, 0 when all are, and how many are."""
+    low, high, far = np.int32(32767), np.int32(-32768), 0
+    for step in steps:
+        if step < -32768 or step > 32767:
+            far += 1
+        else:
+            low, high = min(low, step), max(high, step)
+    if low > high:
+        low = high = np.int32(0)
+    return low, high, far
 
 
 @njit(cache=True, inline="always")
 def _put(room, place, value, width):  # type: ignore[no-untyped-def]
+    whole = np.int64(value)
     for byte in range(width):
-        room[place + byte] = (value >> (8 * byte)) & 255
+        room[place + byte] = (whole >> (8 * byte)) & 255

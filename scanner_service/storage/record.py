@@ -8,9 +8,9 @@ import math
 import random
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from dataclasses import replace
 from datetime import UTC, datetime
+from operator import methodcaller
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -19,6 +19,7 @@ from sqlalchemy.exc import DBAPIError
 
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey
+from scanner_service.storage.answer import Answer
 from scanner_service.storage.batch import Batch, EncodedLine
 from scanner_service.storage.database import SqliteFile
 from scanner_service.storage.errors import NotStorable, RecordNotDurable, RecordNotWritable
@@ -134,7 +135,7 @@ class Record:
 
     # --- lines and events ---------------------------------------------------------------------------------------
 
-    def append(self, session_id: str, line: StoredLine, timeout_s: float = 0.0) -> "Future[Stored]":
+    def append(self, session_id: str, line: StoredLine, timeout_s: float = 0.0) -> Answer[Stored]:
         """Queue a line; the future has its answer after the commit that made it durable has returned.
 
         Never waits unless told to: with a full spool it raises after `timeout_s`, and the line was not taken. The
@@ -146,11 +147,12 @@ class Record:
         """
         encoded = EncodedLine.of(line)
         size_bytes = len(encoded.encoded) + _ROW_BYTES
-        return self._writer.submit(lambda batch: batch.append_line(session_id, encoded), size_bytes, timeout_s, True)
+        store = methodcaller("append_line", session_id, encoded)
+        return self._writer.submit(store, size_bytes, timeout_s, True)
 
     def append_event(
         self, session_id: str, kind: str, details: Mapping[str, Any], timeout_s: float = 0.0
-    ) -> "Future[EventRow]":
+    ) -> Answer[EventRow]:
         """Queue an event behind everything appended before it; answered and refused as a line is."""
         plain_text(kind, "kind of the event")
         size_bytes = len(to_json(details, "details of the event")) + _ROW_BYTES
@@ -252,7 +254,7 @@ class Record:
         """Change a session's state; raises SessionUnknown, SessionDamaged and what `create_session` does."""
         return self.change_state(session_id, state, _PATIENCE_S).result(_PATIENCE_S)
 
-    def change_state(self, session_id: str, state: str, timeout_s: float = 0.0) -> "Future[SessionRow]":
+    def change_state(self, session_id: str, state: str, timeout_s: float = 0.0) -> Answer[SessionRow]:
         """Queue a change of a session's state; the future has its answer when the change is durable."""
         plain_text(state, "state")
         now = self._now()
@@ -266,7 +268,7 @@ class Record:
         now = self._now()
         return self._wait_for(lambda batch: batch.describe(session_id, name, notes, now))
 
-    def save_ledger(self, session_id: str, account: Mapping[str, Any]) -> "Future[None]":
+    def save_ledger(self, session_id: str, account: Mapping[str, Any]) -> Answer[None]:
         """Queue the account of a session's losses, in place of the one before; answered and refused as an event is."""
         account = dict(account)
         size_bytes, now = len(to_json(account, "ledger")) + _ROW_BYTES, self._now()

@@ -126,11 +126,12 @@ class WriterState:
 class Limits:
     """Bounds of the writer. A batch is what queued up while the last commit ran, up to these bounds.
 
-    `linger_s` lets a batch that is not full wait for more lines: fewer syncs, later acknowledgements.
+    The log is copied after `checkpoint_bytes`, while more waits after four times as much. `linger_s` lets a batch that
+    is not full wait for more lines: fewer syncs, later acknowledgements.
     """
 
-    batch_bytes: int = 1 << 20
-    batch_lines: int = 256
+    batch_bytes: int = 4 << 20
+    batch_lines: int = 1024
     linger_s: float = 0.0
     spool_bytes: int = 64 << 20
     checkpoint_bytes: int = 8 << 20

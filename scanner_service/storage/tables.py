@@ -6,6 +6,7 @@ Every row carries a CRC-32 over all its own values, since a database's own check
 import json
 import zlib
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 from sqlalchemy import (
@@ -130,15 +131,31 @@ def row_crc(row: Mapping[str, Any]) -> int:
     return values_crc(values)
 
 
-def line_crc(row: Mapping[str, Any], encoded_crc32: int) -> int:
-    """`row_crc` of a row of `lines`, faster: the same text, put together by hand."""
+LINE_COLUMNS = tuple(column.name for column in lines.columns)
+_quoted = lru_cache(maxsize=256)(json.dumps)
+
+
+def line_row(
+    session_id: str,
+    line_number: int,
+    device_id: str,
+    boot_id: int,
+    line_index: int,
+    pass_index: int,
+    points: int,
+    points_before: int,
+    encoded: bytes,
+    encoded_crc32: int,
+) -> tuple[Any, ...]:
+    """A row of `lines` in the order of LINE_COLUMNS; its checksum is `row_crc`'s, the text put together by hand."""
     text = (
-        f'{{"boot_id": {row["boot_id"]:d}, "device_id": {json.dumps(row["device_id"])}, "encoded": {encoded_crc32:d}, '
-        f'"line_index": {row["line_index"]:d}, "line_number": {row["line_number"]:d}, '
-        f'"pass_index": {row["pass_index"]:d}, "points": {row["points"]:d}, '
-        f'"points_before": {row["points_before"]:d}, "session_id": {json.dumps(row["session_id"])}}}'
+        f'{{"boot_id": {boot_id:d}, "device_id": {_quoted(device_id)}, "encoded": {encoded_crc32:d}, '
+        f'"line_index": {line_index:d}, "line_number": {line_number:d}, "pass_index": {pass_index:d}, '
+        f'"points": {points:d}, "points_before": {points_before:d}, "session_id": {_quoted(session_id)}}}'
     )
-    return zlib.crc32(text.encode())
+    crc32 = zlib.crc32(text.encode())
+    key = (session_id, line_number, device_id, boot_id, line_index, pass_index)
+    return (*key, points, points_before, crc32, encoded)
 
 
 def values_crc(values: Mapping[str, Any]) -> int:

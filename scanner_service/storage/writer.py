@@ -10,7 +10,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
@@ -24,6 +23,7 @@ from sqlalchemy.exc import (
     ProgrammingError,
 )
 
+from scanner_service.storage.answer import Answer, give
 from scanner_service.storage.batch import Batch, batch_number, set_batch_number
 from scanner_service.storage.errors import RecordBusy, RecordClosed, RecordError, RecordUnusable, WriteRefused
 from scanner_service.storage.place import Place, StorageFault
@@ -45,7 +45,7 @@ class Job(Generic[T]):
     run: Callable[[Batch], T]
     size_bytes: int
     is_line: bool
-    answer: "Future[T]"
+    answer: Answer[T]
 
 
 class Writer:
@@ -63,6 +63,7 @@ class Writer:
         self._tails: dict[str, Tail] = {}
         self._since_checkpoint_bytes = limits.checkpoint_bytes  # what a killed service left is copied first of all
         self._change = threading.Condition()
+        self._door = threading.Condition()  # of all answers
         self._queue: deque[Job[Any]] = deque()
         self._in_hand: list[Job[Any]] = []
         self._state = WriterState()
@@ -76,9 +77,7 @@ class Writer:
 
     # --- any thread ---------------------------------------------------------------------------------------------
 
-    def submit(
-        self, run: Callable[[Batch], T], size_bytes: int, timeout_s: float, is_line: bool = False
-    ) -> "Future[T]":
+    def submit(self, run: Callable[[Batch], T], size_bytes: int, timeout_s: float, is_line: bool = False) -> Answer[T]:
         """Queue a job; waits up to `timeout_s` for room in the spool.
 
         Raises
@@ -86,8 +85,7 @@ class Writer:
         RecordBusy : the spool is still full; the job was not taken.
         RecordClosed : the record is closed or closing; the job was not taken.
         """
-        answer: Future[T] = Future()
-        answer.set_running_or_notify_cancel()  # what is in a batch cannot be called back
+        answer: Answer[T] = Answer(self._door)
         with self._change:
             if timeout_s > 0:
                 self._change.wait_for(lambda: self._give_up_s is not None or self._has_room(size_bytes), timeout_s)
@@ -160,7 +158,7 @@ class Writer:
                     self._delete_slice()
                 elif self._give_up_s is not None:
                     break
-                if self._since_checkpoint_bytes >= self._limits.checkpoint_bytes:
+                if self._is_time_to_checkpoint():
                     self._checkpoint()
             self._checkpoint(everything=True)
         except Exception:  # noqa: BLE001 - the thread's loop: whatever it is, nobody may be left waiting
@@ -170,6 +168,11 @@ class Writer:
                 self._give_up_s = time.monotonic()
         finally:
             self._stop()
+
+    def _is_time_to_checkpoint(self) -> bool:
+        """Copying is put off while jobs wait, up to four times as much."""
+        due, most = self._limits.checkpoint_bytes, 4 * self._limits.checkpoint_bytes
+        return self._since_checkpoint_bytes >= (most if self._queue else due)
 
     def _take(self) -> list[Job[Any]]:
         """What is queued, up to the bounds of a batch; empty when closing, or when there is time for deleting."""
@@ -259,11 +262,7 @@ class Writer:
                 if isinstance(answer, Stored):
                     self._counts[names[answer.outcome]] += 1
             self._change.notify_all()
-        for job, answer in zip(jobs, answers, strict=True):
-            if isinstance(answer, Exception):
-                job.answer.set_exception(answer)
-            else:
-                job.answer.set_result(answer)
+        give([job.answer for job in jobs], answers, self._door)
 
     def _wait_to_retry(self, error: Exception, delay_s: float, attempts: int) -> bool:
         """Say what is wrong and wait; False when it is time to give up."""
@@ -291,8 +290,21 @@ class Writer:
                 self._check_nobody_else_wrote(self._connection)
             except RecordUnusable as error:
                 raise StorageFault(str(error)) from error
-        with self._connection.begin():
-            yield self._connection
+        try:
+            with self._connection.begin():
+                yield self._connection
+        except BaseException:
+            self._leave_transaction()
+            raise
+
+    def _leave_transaction(self) -> None:
+        """After a COMMIT that failed SQLAlchemy believes the transaction over, and the database may still be in it."""
+        if self._connection is None or self._connection.invalidated:
+            return
+        try:
+            self._connection.connection.rollback()
+        except Exception:  # noqa: BLE001 - a connection that cannot even do this is thrown away
+            self._disconnect()
 
     def _check_nobody_else_wrote(self, connection: Connection) -> None:
         """While we were without a connection, and without its lock, another service may have taken the record over."""
@@ -308,7 +320,7 @@ class Writer:
 
     def _delete_slice(self) -> None:
         session_id = self._deleting[0]
-        job: Job[bool] = Job(lambda batch: batch.delete_slice(session_id), 0, False, Future())
+        job: Job[bool] = Job(lambda batch: batch.delete_slice(session_id), 0, False, Answer(self._door))
         self._store([job])
         self._since_checkpoint_bytes += self._limits.batch_bytes
         if job.answer.exception() is None and job.answer.result():

@@ -34,10 +34,10 @@ assert state.state == "failing", state
 assert durable == readable == state.stored, (durable, readable, state)
 assert 0 < state.waiting_lines == len(taken) - durable, (durable, len(taken), state)
 resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
-assert [future.result(timeout=30).line_number for future in taken] == list(range(len(taken)))
+assert [future.result(timeout_s=30).line_number for future in taken] == list(range(len(taken)))
 state = record.writer_state()
 assert (state.state, state.stored, state.duplicates, state.refused) == ("ok", len(taken), 0, 1), state
-record.append(session, line_of(len(taken), points=600)).result(timeout=30)
+record.append(session, line_of(len(taken), points=600)).result(timeout_s=30)
 record.close()
 print(session, len(taken) + 1)
 """

@@ -214,10 +214,12 @@ def test_a_file_is_brought_over_rest_played_and_removed(running):
     service.wait_for_state(session_id, "stopped")
     assert service.status(session_id)["lines"] == 4
     refused = service.client.put("/api/v1/files/my scan.csv", content=scan + b"4,0,4,0,2,4,90\n")
-    assert refused.status_code == 422 and "another file" in refused.json()["detail"]
+    assert (refused.status_code, refused.json()["type"]) == (409, "/problems/name-taken")
+    assert "another file" in refused.json()["detail"]
     assert service.client.put("/api/v1/files/x.bin", content=bytes(99)).status_code == 422
     assert service.client.put("/api/v1/files/..%2Fx.csv", content=scan).status_code in (400, 404, 422)
     assert service.client.delete("/api/v1/files/my scan.csv").status_code == 204
+    assert service.client.delete("/api/v1/files/my scan.csv").status_code == 404
     assert service.client.get("/api/v1/files").json()["files"] == []
     assert service.status(session_id)["lines"] == 4
 

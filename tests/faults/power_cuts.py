@@ -9,11 +9,11 @@ import random
 import sqlite3
 import tempfile
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from scanner_service.storage.answer import Answer
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import Limits, Stored
 from tests.faults.power_cut import DiskImage
@@ -98,7 +98,7 @@ def _at_work(folder: Path, rng: random.Random, connection_class: type[sqlite3.Co
 
 def _do_something(record: Record, run: _Run, rng: random.Random, index: int, stop: int) -> int:
     disk, session = run.disk, run.session
-    futures: list[Future[Any]] = []
+    futures: list[Answer[Any]] = []
     match rng.randrange(10):
         case 0:
             number = record.append_event(session, "mark", {"index": index}).result().number
@@ -127,8 +127,8 @@ def _do_something(record: Record, run: _Run, rng: random.Random, index: int, sto
     return index
 
 
-def _marking(disk: Disk, line_index: int) -> Callable[["Future[Stored]"], None]:
-    def acknowledged(future: "Future[Stored]") -> None:
+def _marking(disk: Disk, line_index: int) -> Callable[[Answer[Stored]], None]:
+    def acknowledged(future: Answer[Stored]) -> None:
         disk.mark(("line", line_index, future.result().line_number))
 
     return acknowledged

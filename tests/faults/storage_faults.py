@@ -9,11 +9,11 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from scanner_service.storage.answer import Answer
 from scanner_service.storage.errors import RecordBusy, RecordError, RecordUnusable
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import Limits
@@ -138,7 +138,7 @@ def _patiently(ask: Callable[[], Any], record: Record, heal: Callable[[], None])
     for attempt in range(2000):
         try:
             answer = ask()
-            if not isinstance(answer, Future):
+            if not isinstance(answer, Answer):
                 return list(answer)
             _await(answer, record, heal)
             return []
@@ -150,7 +150,7 @@ def _patiently(ask: Callable[[], Any], record: Record, heal: Callable[[], None])
     return []
 
 
-def _await(future: "Future[Any]", record: Record, heal: Callable[[], None]) -> None:
+def _await(future: Answer[Any], record: Record, heal: Callable[[], None]) -> None:
     """Wait for an answer; when none comes for a while the record must say that it fails, and the disk is healed."""
     try:
         future.result(ILL_S)
@@ -160,7 +160,7 @@ def _await(future: "Future[Any]", record: Record, heal: Callable[[], None]) -> N
         future.result(_PATIENCE_S)
 
 
-def _saying(said: list[tuple[int, Any]], index: int) -> Callable[["Future[Any]"], None]:
+def _saying(said: list[tuple[int, Any]], index: int) -> Callable[[Answer[Any]], None]:
     return lambda future: said.append((index, future.exception() or future.result()))
 
 

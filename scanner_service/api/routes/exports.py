@@ -33,7 +33,7 @@ class ExportIn(BaseModel):
 
     formats: Annotated[
         list[Annotated[str, Field(max_length=20)]],
-        Field(min_length=1, max_length=len(FORMATS), examples=[["laz", "report"]]),
+        Field(min_length=1, max_length=len(FORMATS) + 1, examples=[["laz", "report"]]),
     ]
 
 
@@ -58,6 +58,7 @@ def job_answer(job: ExportJob) -> dict[str, Any]:
         "doing": job.doing,
         "share": job.share,
         "failure": job.failure,
+        "left_out": {} if job.manifest is None else job.manifest["left_out"],
         "files": [{"name": name, "url": f"{base}/files/{name}", **said.get(name, {})} for name in job.files],
     }
 
@@ -82,7 +83,10 @@ def list_exports(desk: Desk, session_id: str) -> Response:
 
 @router.post("", status_code=202, dependencies=[operator])
 def order_export(desk: Desk, session_id: str, body: ExportIn) -> Response:
-    """Have the session written in the formats named; it is written while you ask how far it is."""
+    """Have the session written in the formats named, `all` for every one that can be written here.
+
+    It is written while you ask how far it is; what `all` left out is told under `left_out`, with the reason.
+    """
     job = desk.order(session_id, body.formats)
     return answer(job_answer(job), 202, {"Location": f"/api/v1/sessions/{session_id}/exports/{job.job_id}"})
 

@@ -38,19 +38,19 @@ def open_recording(path: Path, options: ReadOptions | None = None) -> Recording:
     options = options or ReadOptions()
     kind = _kind_of_file(path, options)
     if kind in ("pcd", "las", "e57"):
-        raise NoScanlines(f"{path.name} is a plain cloud without scanlines; analyse it as a cloud")
+        raise _plain_cloud(path.name)
     data = _content(path, options)
     if kind == "ply":
         vertices = read_vertices(data, path.name, options.units)
         if vertices.grid is None:
-            raise NoScanlines(f"{path.name} is a plain cloud without scanlines (no range_grid); analyse it as a cloud")
+            raise _plain_cloud(path.name, " (no range_grid)")
         return recording_of_grid(vertices, path.name, options)
     if kind == "csv profiles":
         return read_csv_recording(_text(data, path.name), path.name, options)
     if kind == "joescan":
         return read_joescan(data, path.name, options)
     if kind == "xyz":
-        raise NoScanlines(f"{path.name} is a plain cloud without scanlines; analyse it as a cloud")
+        raise _plain_cloud(path.name)
     raise _is_a_record(path.name)
 
 
@@ -123,6 +123,13 @@ def kind_of_content(head: bytes, name: str) -> Kind:
             raise unknown from None
         return "xyz"
     return "xyz"
+
+
+def _plain_cloud(name: str, why: str = "") -> NoScanlines:
+    return NoScanlines(
+        f"{name} is a plain cloud without scanlines{why}, which cannot be played: analyse it as a cloud, "
+        "with `scanner analyse` or over REST (POST /api/v1/analyses), which also give it back as a PLY"
+    )
 
 
 def _is_a_record(name: str) -> FormatUnknown:

@@ -2,6 +2,7 @@
 
 import json
 import struct
+import sys
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -295,6 +296,21 @@ def test_formats_that_do_not_exist_are_refused_before_any_work(scanned, tmp_path
     with pytest.raises(FormatNotWritten, match="the formats are ply, laz"):
         export(scanned[0], formats, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_all_writes_what_it_can_and_says_what_it_left_out_and_why(scanned, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "laspy", None)  # as on a computer where it is not installed
+    manifest = export(scanned[0], ["all"], tmp_path / "whole")
+    left_out = manifest["left_out"]
+    assert {"laz", "las"} <= set(left_out) and "pip install" in left_out["laz"]
+    assert {"points.ply", "points.csv", "report.html", "session.sqlite"} <= set(manifest["files"])
+    reader = RecordReader.open(scanned[0])
+    row = find_session(reader, "latest")
+    manifest = export_session(reader, row, ["all"], tmp_path / "slabs", NOW, points_at_once=500)
+    reader.close()
+    assert {"results", "report"} <= set(manifest["left_out"]) and "report.html" not in manifest["files"]
+    assert {"points.ply", "session.sqlite"} <= set(manifest["files"])
+    assert verify_folder(tmp_path / "slabs").manifest["left_out"] == manifest["left_out"]
 
 
 def test_a_session_of_more_points_than_allowed_is_written_in_slabs_without_a_verdict(scanned, tmp_path):

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from scanner_service.sessions import file_shelf
-from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SourceUnusable
+from scanner_service.sessions.errors import BudgetSpent, FileUnknown, NameTaken, SessionBusy, SourceUnusable
 from scanner_service.sessions.file_shelf import MAX_FILE_BYTES, RESERVE_BYTES, FileShelf, ShelfFile
 from scanner_service.storage.database import MOST_VALUE_BYTES
 from scanner_service.storage.formats import FileEmpty, FormatUnknown
@@ -41,13 +41,13 @@ def test_a_file_is_there_when_it_is_whole_and_never_replaces_another(shelf):
     assert shelf.files() == [] and is_clean(shelf)
     kept = ShelfFile("part.csv", len(TEXT), "csv profiles")
     assert bring(shelf, "part.csv", TEXT) == bring(shelf, "part.csv", TEXT) == kept
-    with pytest.raises(SourceUnusable, match="another file"):
+    with pytest.raises(NameTaken, match="another file"):
         bring(shelf, "part.csv", TEXT.replace(b"3", b"4"))
     assert (shelf.folder / "part.csv").read_bytes() == TEXT
     assert shelf.files() == [kept] and is_clean(shelf)
     shelf.remove("part.csv")
     assert shelf.files() == []
-    with pytest.raises(SourceUnusable):
+    with pytest.raises(FileUnknown):
         shelf.remove("../arriving")
 
 

@@ -1,6 +1,8 @@
 """What a session tells of its losses balances in every answer, however wire, session and record run on meanwhile."""
 
 import time
+from contextlib import closing
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -10,8 +12,11 @@ from hypothesis import strategies as st
 from drivers.scanline import DeviceInfo, SensorGeometry
 from drivers.tally import BootLedger
 from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.reporting import report_of
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
+from scanner_service.sessions.stored import read_session
+from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
 from tests.unit.analysis.scans import scanline
 
@@ -22,11 +27,12 @@ ROW_MM = np.column_stack([np.arange(20) * 0.2, np.zeros(20), np.zeros(20)])
 class RestlessWire:
     """A scanner whose lines come exactly while its accounts are being read: before, between and after them."""
 
-    def __init__(self, meanwhile):
+    def __init__(self, meanwhile, boot_id=1):
         self.geometry, self.towards_sensor = GEOMETRY, np.array([0.0, 0.0, 1.0])
         self.info = DeviceInfo("A", "M", "F", "C", 1, 20, GEOMETRY)
         self._meanwhile = meanwhile
-        self._account = BootLedger(boot_id=1)
+        self._account = BootLedger(boot_id=boot_id)
+        self.boot_id = boot_id
         self._next = self._delivered = 0
 
     def start(self, sink):
@@ -56,7 +62,7 @@ class RestlessWire:
             if not is_lost:
                 self._account.chunk(number, number, 0, 0)
                 self._account.line_closed(whole=True)
-                self._sink.line(scanline(ROW_MM + np.array([0.0, 0.2 * number, 0.0]), number))
+                self._sink.line(scanline(ROW_MM + np.array([0, 0.2 * number, 0]), number, boot_id=self.boot_id))
                 self._delivered += 1
         while self._sink.engine.ledger.snapshot().received < self._delivered:  # until the session has heard of all
             time.sleep(0.001)
@@ -89,3 +95,39 @@ def test_every_answer_balances_and_nothing_is_less_than_under_way(book, meanwhil
     session.stop()
     (account,) = session.losses()["passes"] or [None]
     assert account is None or account["lines"]["under_way"] >= 0
+
+
+def test_the_scanner_s_losses_are_those_of_all_passes_also_after_a_restart(tmp_path):
+    sound, gap = [False, False, False], [False, True, False]  # a gap is known by the line behind it
+    passes = [[sound], [gap, sound], [gap]]
+    with Record.open(tmp_path / "r") as record:
+        book = SessionBook(record)
+        session = book.create("passes", PushSpec(), SessionSettings(max_points=20_000), source=RestlessWire(passes[0]))
+        session.start()
+        assert wait_for_account(session) == (3, {})
+        session.stop()
+        session.carry_out(lambda: RestlessWire(passes[1], boot_id=2))
+        assert wait_for_account(session) == (9, {"missing": 1})
+        session.stop()
+        session_id = session.row.session_id
+        book.close()
+    with Record.open(tmp_path / "r") as record:
+        book = SessionBook(record)
+        session = book.get(session_id)
+        assert wait_for_account(session) == (9, {"missing": 1})
+        session.carry_out(lambda: RestlessWire(passes[2], boot_id=3))
+        assert wait_for_account(session) == (12, {"missing": 2})
+        session.stop()
+        book.close()
+    with closing(RecordReader.open(tmp_path / "r")) as reader:
+        content = report_of(read_session(reader, reader.get_session(session_id), with_stages=True), datetime.now(UTC))
+    told = dict(dict(content.losses)["Scanlines of each pass, from the scanner to the record"])
+    assert told["all passes"] == "12 sent, 10 stored; lost: 2 missing"
+    assert dict(dict(content.losses)["Scanner and wire, all passes"])["lines · sent"] == "12"
+
+
+def wait_for_account(session):
+    """Lines sent and lost, once the account of the wire has nothing more to tell of."""
+    for _ in range(6):
+        told = session.losses()
+    return told["device"]["lines"]["sent"], told["device"]["lines"]["lost"]

@@ -13,7 +13,7 @@ from scanner_service.rescan.passes.serving import Serving
 from scanner_service.rescan.passes.tried import TRIES
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.book import SessionBook
-from scanner_service.sessions.closed_loop import LoopLimits
+from scanner_service.sessions.closed_loop import LoopLimits, LoopState
 from scanner_service.sessions.errors import PassUnknown, SessionBusy
 from scanner_service.sessions.pass_orders import PassStatus
 from scanner_service.sessions.rig_setups import RigSetup
@@ -291,6 +291,21 @@ def test_a_rig_that_a_client_drives_is_looped(book, scanned):
     assert loop.why_ended == "the limit of 2 passes is met"
     assert [order.status for order in desk.orders()] == [PassStatus.DONE] * 2
     assert desk.orders()[0].outcome.reached_mm2 > 0.7 * desk.orders()[0].outcome.promised_mm2
+
+
+def test_a_session_between_two_passes_of_its_loop_is_not_closed_to_make_room(book, monkeypatch):
+    monkeypatch.setattr("scanner_service.sessions.book.MAX_LIVE", 2)
+    looping, idle = (book.create(name, PushSpec(), SessionSettings(max_points=1000)) for name in ("looping", "idle"))
+    for session in (looping, idle):
+        session.stop()
+    desk = book.pass_desk(looping)
+    desk.loop = LoopState(LoopLimits())
+    third = book.create("third", PushSpec(), SessionSettings(max_points=1000))
+    assert book.open_sessions() == [looping, third]
+    third.stop()
+    desk.loop.running = False
+    fourth = book.create("fourth", PushSpec(), SessionSettings(max_points=1000))
+    assert book.open_sessions() == [third, fourth]
 
 
 def test_a_hand_cannot_be_looped(book, scanned):

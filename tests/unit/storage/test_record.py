@@ -4,7 +4,6 @@ import json
 import random
 import sqlite3
 from collections.abc import Iterator
-from concurrent.futures import Future
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from scanner_service.storage.answer import Answer
 from scanner_service.storage.errors import (
     NotStorable,
     RecordBusy,
@@ -102,7 +102,7 @@ def test_a_key_is_stored_once_in_order_whatever_the_batches_and_the_failing_comm
 def test_a_range_of_lines_is_that_slice_of_all(record: Record) -> None:
     session = record.create_session("slices").session_id
     for index in range(70):
-        record.append(session, line_of(index)).add_done_callback(Future.result)
+        record.append(session, line_of(index)).add_done_callback(Answer.result)
     record.append_event(session, "end", {}).result()
     numbers = [number for number, _ in record.lines(session)]
     assert numbers == list(range(70))
@@ -187,8 +187,31 @@ def test_nothing_is_acknowledged_while_the_disk_fails_and_everything_is_once_it_
         assert str(state) == "failing: disk I/O error" and state.waiting_lines == 1 and not future.done()
         assert list(record.lines(session)) == []
         plan.clear()
-        assert future.result(timeout=20) == Stored(0, "stored")
+        assert future.result(timeout_s=20) == Stored(0, "stored")
         assert (record.writer_state().state, record.writer_state().waiting_lines) == ("ok", 0)
+
+
+def test_after_a_failed_commit_the_next_attempt_begins_outside_of_any_transaction(tmp_path: Path) -> None:
+    plan, said = ["none"], []
+
+    class Noting(sqlite3.Cursor):
+        def execute(self, *arguments: Any) -> Any:
+            try:
+                return super().execute(*arguments)
+            except sqlite3.Error as error:
+                said.append(str(error))
+                raise
+
+    class Noted(faulty_disk(plan)):  # type: ignore[misc]
+        def cursor(self, factory: type[sqlite3.Cursor] = Noting) -> Any:
+            return super().cursor(factory)
+
+    with Record.open(tmp_path / "r", limits=FAST, connection_class=Noted) as record:
+        session = record.create_session("open").session_id
+        plan[:] = ["before"] * 3  # fewer than make the writer open a new connection
+        assert record.append(session, line_of(0)).result(timeout_s=60) == Stored(0, "stored")
+        assert record.writer_state().retries == 3
+    assert said == []
 
 
 def test_a_full_spool_refuses_counts_and_takes_no_more_than_its_bound(tmp_path: Path) -> None:
@@ -206,7 +229,7 @@ def test_a_full_spool_refuses_counts_and_takes_no_more_than_its_bound(tmp_path: 
         state = record.writer_state()
         assert state.refused == 2 and state.waiting_lines == len(taken) > 5 and state.waiting_bytes <= 20_000
         plan.clear()
-        assert [future.result(timeout=20).line_number for future in taken] == list(range(len(taken)))
+        assert [future.result(timeout_s=20).line_number for future in taken] == list(range(len(taken)))
 
 
 def test_closing_on_a_dead_disk_says_how_many_lines_are_not_confirmed(tmp_path: Path) -> None:
@@ -218,7 +241,7 @@ def test_closing_on_a_dead_disk_says_how_many_lines_are_not_confirmed(tmp_path: 
     assert record.close(timeout_s=0.05) == 4
     for future in futures:
         with pytest.raises(RecordClosed):
-            future.result(timeout=0)
+            future.result(timeout_s=0)
     with pytest.raises(RecordClosed):
         record.append(session, line_of(9))
     record.close()
@@ -234,7 +257,7 @@ def test_a_removed_file_stops_acknowledgements_until_it_is_back(tmp_path: Path) 
             pass
         assert "removed or replaced" in record.writer_state().reason and not future.done()
         aside.rename(path)
-        assert future.result(timeout=20) == Stored(0, "stored")
+        assert future.result(timeout_s=20) == Stored(0, "stored")
 
 
 def test_a_line_of_no_session_is_refused_and_the_others_of_its_batch_are_stored(record: Record) -> None:

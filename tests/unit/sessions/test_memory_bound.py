@@ -1,0 +1,28 @@
+"""The points that an export holds at once follow from the memory that it may take."""
+
+from scanner_service.sessions.memory_bound import (
+    BYTES_A_POINT,
+    FIXED_BYTES,
+    LEAST_POINTS,
+    MOST_POINTS,
+    available_bytes,
+    points_at_once,
+)
+
+
+def test_what_is_held_at_once_fits_into_the_memory_given():
+    for memory_bytes in (1 << 30, 3 << 30, 40 << 30):
+        points = points_at_once(memory_bytes)
+        assert FIXED_BYTES + points * BYTES_A_POINT <= memory_bytes < FIXED_BYTES + (points + 1) * BYTES_A_POINT
+    assert points_at_once(1) == LEAST_POINTS
+    assert LEAST_POINTS <= points_at_once() <= MOST_POINTS
+
+
+def test_free_memory_is_what_the_system_says_or_unknown(tmp_path):
+    said = tmp_path / "meminfo"
+    said.write_text("MemTotal:       8000000 kB\nMemAvailable:   4000000 kB\n")
+    assert available_bytes(said) == 4_096_000_000
+    for nonsense in ("", "MemAvailable:\n", "MemAvailable: many kB\n"):
+        said.write_text(nonsense)
+        assert available_bytes(said) is None
+    assert available_bytes(tmp_path / "absent") is None
