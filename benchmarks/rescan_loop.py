@@ -16,7 +16,7 @@ from drivers.scanline import Float64Array, Pose, Scanline
 from scanner_service.analysis.intake import quantise
 from scanner_service.analysis.live_map import LiveMap, MapSettings
 from scanner_service.analysis.snapshot import MapSnapshot
-from scanner_service.rescan.passes.experience import chances_of, trust_of
+from scanner_service.rescan.passes.experience import chances_of
 from scanner_service.rescan.passes.looks import look_of
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.optics import ScannerOptics
@@ -282,7 +282,7 @@ def closed_loop(
     snapshot, report = judged(scan, scanner)
     plan: Plan | None = None
     for _ in range(MAX_PASSES):
-        wishes = Wishes(DENSITY_PER_MM2, max_passes=1, chances=chances_of(earlier), trust=trust_of(earlier))
+        wishes = Wishes(DENSITY_PER_MM2, max_passes=1, chances=chances_of(earlier))
         begun = time.perf_counter()
         looks = [look_of(snapshot, n, *one, scanner.points_per_line) for n, one in enumerate(scan.looks)]
         seen = tuple(look for look in looks if look is not None)
@@ -295,8 +295,8 @@ def closed_loop(
         scan.drive(chosen.motion.part_from_sensor, chosen.start_mm, chosen.end_mm, chosen.line_spacing_mm)
         was, was_report = snapshot, report
         snapshot, report = judged(scan, scanner)
-        outcome: Outcome = reckon(chosen, was, was_report, snapshot, report, wishes.cell_mm)
-        tried = tried.and_also(outcome.missed_mm)
+        outcome: Outcome = reckon(chosen, was, was_report, snapshot, report, optics)
+        tried = tried.and_also(outcome.missed_mm, outcome.empty_mm)
         earlier.append(outcome)
         scan.run.promised_mm2.append(outcome.promised_mm2)
         scan.run.reached_mm2.append(outcome.reached_mm2)
@@ -307,7 +307,7 @@ def closed_loop(
 
 def _told(scan: Scan, chosen: RecommendedPass, outcome: Outcome, plan: Plan, reach: Reach) -> str:
     run = scan.run
-    kinds = ", ".join(f"{one.evidence.name.lower()} {one.kept_mm2:.0f}/{one.asked_mm2:.0f}" for one in outcome.kinds)
+    kinds = ", ".join(f"{one.evidence.name.lower()} {one.reached_mm2:.0f}/{one.asked_mm2:.0f}" for one in outcome.kinds)
     return (
         f"  pass {len(run.seconds)}: {run.seconds[-1]:.1f} s, {run.coverage[-1]:.2%}, promised "
         f"{outcome.promised_mm2:.0f}, reached {outcome.reached_mm2:.0f} and {outcome.besides_mm2:.0f} besides "

@@ -102,7 +102,8 @@ def _said(order: dict[str, Any]) -> str:
     if order["outcome"] is None:
         return f"{head}: {order['message'] or order['status']}"
     outcome = order["outcome"]
-    return f"{head}: promised {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²"
+    doubt = f"; warning: {outcome['doubt']}" if outcome["doubt"] else ""
+    return f"{head}: promised {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²{doubt}"
 
 
 def _tell_plan(plan: dict[str, Any]) -> None:

@@ -40,7 +40,6 @@ def keep_pass(one: RecommendedPass) -> dict[str, Any]:
         "places": base64.b64encode(rows.astype("<f4").tobytes()).decode("ascii"),
         "turn": None if one.turn is None else [one.turn.about_vertical_rad, one.turn.tip_rad],
         "chances": list(one.chances),
-        "trust": one.trust,
     }
 
 
@@ -61,7 +60,7 @@ def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
     numbers = {
         name: float(kept[name])
         for name in (
-            "start_mm", "end_mm", "line_spacing_mm", "line_rate_hz", "duration_s", "approach_s", "trust",
+            "start_mm", "end_mm", "line_spacing_mm", "line_rate_hz", "duration_s", "approach_s",
         )
     }  # fmt: skip
     turn, chances = kept["turn"], tuple(map(float, kept["chances"]))

@@ -26,7 +26,9 @@ _OTHER_SIDE = -0.5  # cosine between normals beyond which two places are the two
 _THROUGH = 2.8  # cells: how thick a wall may be of which one side is told by the other
 _AROUND = 24
 _BARE = 0.25  # a region is rarely a square around its middle
-_SURE = 0.6  # share of solid cells around from which on hidden space is taken to begin with surface
+_SURE = 0.6  # share of solid cells around from which on hidden space is taken to begin with surface ...
+_RARE = 0.4  # ... and up to which it rarely does: an edge of a shadow, or a thin rest
+_LEAST_SURE = 0.1
 _ANOTHER = 0.7  # a noisy place is looked at from at most this share of the angle at which it was noisy
 _HEAD_ON_RAD = math.radians(20.0)  # ... and nearer to the normal than this no direction is better
 _OUTNUMBER = 1.25
@@ -44,9 +46,12 @@ class Evidence(IntEnum):
     BEYOND = 4  # hidden space goes on beyond the outermost points
 
 
+HIDDEN_KINDS = (Evidence.FRONTIER, Evidence.BEYOND)
+"""Hidden space is taken to begin with surface."""
+
 Chances = tuple[float, ...]
-"""How likely a place is what it seems, by `Evidence`; of hidden space before its edges are counted for less."""
-FIRST_CHANCES: Chances = (1.0, 0.9, 1.2, 0.9, 1.2)
+"""Good surface for each mm² that is believed in, by `Evidence`; of hidden space before edges are counted for less."""
+FIRST_CHANCES: Chances = (1.0, 1.0, 1.3, 0.9, 1.5)
 """... before a pass has shown it."""
 
 
@@ -175,7 +180,7 @@ def find_needs(
         np.concatenate(pair) for pair in zip(found, bare, strict=True)
     )  # fmt: skip
     n = len(area)
-    chance = np.minimum(np.array(chances)[evidence] * sure, 1.0)
+    chance = np.array(chances)[evidence] * sure
     needs = Needs(
         places, normals, area, region, evidence, np.full(n, wanted.density_per_mm2), chance,
         np.full(n, wanted.line_spacing_mm), np.full(n, wanted.incidence_rad),
@@ -236,7 +241,7 @@ def _floors(
 def _frontier(surface: KnownSurface) -> Columns:
     """Where hidden space begins; it belongs to no region. Edges and thin rests of it are rarely surface."""
     n = len(surface.frontier_mm2)
-    sure = np.minimum(1.0, surface.frontier_solid / _SURE) ** 2
+    sure = np.clip((surface.frontier_solid - _RARE) / (_SURE - _RARE), _LEAST_SURE, 1.0)
     kind = np.full(n, Evidence.FRONTIER, dtype=np.int64)
     if len(surface.points_mm):
         low, high = surface.points_mm.min(axis=0), surface.points_mm.max(axis=0)
@@ -334,7 +339,7 @@ def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, e
         keep[guessed] = ~is_near | (other_side & ~seen)
     keep[_in_the_air(surface, places, normals) & (evidence == Evidence.FLOOR)] = False
     floors = np.flatnonzero((evidence == Evidence.FLOOR) & keep)
-    frontier = np.flatnonzero(np.isin(evidence, (Evidence.FRONTIER, Evidence.BEYOND)) & keep)
+    frontier = np.flatnonzero(np.isin(evidence, HIDDEN_KINDS) & keep)
     if len(floors) and len(frontier):
         near, _ = cKDTree(places[floors]).query(places[frontier], distance_upper_bound=surface.cell_mm)
         keep[frontier] = ~np.isfinite(near)

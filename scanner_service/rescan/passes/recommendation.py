@@ -45,8 +45,8 @@ class RecommendedPass:
     `promises` what it is to give, region by region; `gain_mm2` their sum. `places_mm` (k, 3) are the places served,
     `place_regions` (k,) their regions, `place_evidence` (k,) why they are believed in, `place_area_mm2` (k,) their
     areas, `place_mm2` (k,) what of these is promised, and `place_normals` (k, 3) where they face; they are kept for the
-    reckoning afterwards. `turn` is what the operator does first; `chances` (by evidence) and `trust` are what
-    the promises were multiplied by, from earlier outcomes.
+    reckoning afterwards. `turn` is what the operator does first; `chances` (by evidence) are what the
+    promises were multiplied by, from earlier outcomes.
     """
 
     number: int
@@ -66,7 +66,6 @@ class RecommendedPass:
     place_normals: Float64Array
     turn: PartTurn | None = None
     chances: Chances = FIRST_CHANCES
-    trust: float = 1.0
 
     def __post_init__(self) -> None:
         for array in (

@@ -85,6 +85,7 @@ export class PassesPanel {
       "li.pass",
       {},
       element("span", {}, `Order ${order}: ${said}`),
+      outcome?.doubt ? element("span.doubt", { role: "alert" }, `Warning: ${outcome.doubt}.`) : null,
       status === "accepted" ? element("button", { type: "button", onclick: go }, pass.turn_part ? "The part is turned: carry out" : "Carry out (laser on)") : null,
       status === "accepted" ? element("button.quiet", { type: "button", onclick: () => this.#act(() => cancelOrder(this.#id, order)) }, "Cancel") : null,
     );
