@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.scanline import Float64Array, Pose
 from scanner_service.rescan.passes.motion import Motion, StraightMotion, TurningMotion
-from scanner_service.rescan.passes.needs import Evidence
+from scanner_service.rescan.passes.needs import FIRST_CHANCES, Evidence
 from scanner_service.rescan.passes.reach import PartTurn
 from scanner_service.rescan.passes.recommendation import Promise, RecommendedPass, pose_dict
 
@@ -64,8 +64,9 @@ def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
         )
     }  # fmt: skip
     turn, chances = kept["turn"], tuple(map(float, kept["chances"]))
-    if len(chances) != len(Evidence):
+    if len(chances) > len(Evidence):
         raise ValueError(f"a kept pass has {len(chances)} chances, and there are {len(Evidence)} kinds of evidence")
+    chances += FIRST_CHANCES[len(chances) :]  # of a time when fewer kinds were told apart
     return RecommendedPass(
         number=int(kept["number"]),
         motion=kept_motion(kept["motion"]),

@@ -201,17 +201,16 @@ def outward(state, cells, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def surrounded(state, cells, out):
-    """Share (m,) of the cells within three of each of some cells (m, 3) that are HIDDEN or SURFACE."""
-    ni, nj, nk = state.shape
+def share_around(mask, cells, out):
+    """Share (m,) of the cells within three of each of some cells (m, 3) that are in a mask of the grid's shape."""
+    ni, nj, nk = mask.shape
     for n in range(len(cells)):
-        solid = 0
+        inside = 0
         for i in range(max(0, cells[n, 0] - 3), min(ni, cells[n, 0] + 4)):
             for j in range(max(0, cells[n, 1] - 3), min(nj, cells[n, 1] + 4)):
                 for k in range(max(0, cells[n, 2] - 3), min(nk, cells[n, 2] + 4)):
-                    if state[i, j, k] >= HIDDEN:
-                        solid += 1
-        out[n] = solid / 343.0
+                    inside += mask[i, j, k]
+        out[n] = inside / 343.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

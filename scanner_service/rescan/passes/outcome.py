@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from drivers.scanline import Float64Array, read_only
+from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.agreement import Agreement, agreement_of
 from scanner_service.rescan.passes.known_surface import IntArray, KnownSurface, know_surface
@@ -63,7 +63,8 @@ class Outcome:
     `besides_mm2` is good surface that was found where nothing was promised. `missed_mm` (k, 3) are the places that the
     pass was to serve and did not, `empty_mm` (e, 3) those of them where hidden space was expected to begin with surface
     and none was found near. `agreement` says how well its points lie on what was known; None: not looked at.
-    `doubt` is what the operator is told when they do not.
+    `doubt` is what the operator is told when they do not. `explores`: what was promised was mostly an expectation of
+    hidden space.
     """
 
     regions: tuple[RegionOutcome, ...]
@@ -72,6 +73,7 @@ class Outcome:
     besides_mm2: float = 0.0
     agreement: Agreement | None = None
     doubt: str | None = None
+    explores: bool = False
     empty_mm: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
@@ -91,6 +93,7 @@ class Outcome:
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
         return {
+            "explores": self.explores,
             "promised_mm2": self.promised_mm2,
             "reached_mm2": self.reached_mm2,
             "besides_mm2": self.besides_mm2,
@@ -125,7 +128,16 @@ class Outcome:
         )
         agreement = Agreement.from_dict(kept["agreement"]) if kept.get("agreement") else None
         besides, doubt = float(kept.get("besides_mm2", 0.0)), kept.get("doubt")
-        return cls(regions, missed, kinds, besides, agreement, None if doubt is None else str(doubt), empty)
+        return cls(
+            regions,
+            missed,
+            kinds,
+            besides,
+            agreement,
+            None if doubt is None else str(doubt),
+            bool(kept.get("explores")),
+            empty,
+        )
 
 
 def reckon(
@@ -141,7 +153,8 @@ def reckon(
 
     Good surface is a cell less than half of whose points fail, each side of a thin wall for itself. What is good after
     the pass and lies near no cell that was good before is reached where it belongs to a place that was to be served
-    (`owners_of`), and is given to that place's region and kind of evidence; elsewhere it was found besides.
+    (`owners_of`), and is given to that place's region and kind of evidence; elsewhere it was found besides. A place
+    that was measured before is reached when its own cell is good.
     """
     old = know_surface(before, *failing_points(before_report), cell_mm)
     new = know_surface(after, *failing_points(after_report), cell_mm)
@@ -161,6 +174,10 @@ def reckon(
     owner = owners_of(done, places, optics, _THERE * cell)
     is_owned = owner != _NOBODY
     reached = np.asarray(np.bincount(owner[is_owned], area_mm2[is_owned], len(missed)), dtype=np.float64)
+    measured = done.place_evidence == Evidence.MEASURED
+    good = _good_now(old, after, after_report, done.places_mm[measured])
+    reached[measured] = np.where(good, done.place_area_mm2[measured], 0.0)
+    missed[measured] &= ~good
     away, _ = _nearest(done.places_mm[reached > 0], done.places_mm, _BESIDE_MM)
     empty = missed & ~np.isfinite(away) & np.isin(done.place_evidence, HIDDEN_KINDS)
     regions = [
@@ -174,8 +191,27 @@ def reckon(
     agreement = agreement_of(old, after, added)
     return Outcome(
         tuple(regions), done.places_mm[missed], _kinds(done, reached), besides, agreement, agreement.doubt(done.turn),
+        done.explores,
         done.places_mm[empty],
     )  # fmt: skip
+
+
+def _good_now(old: KnownSurface, after: MapSnapshot, after_report: RegionReport, places_mm: Float64Array) -> BoolArray:
+    """(n,) whether less than half of the points in the cell of each place, as it was before, fail after the pass."""
+    keys, cell_of = np.unique(old.keys(places_mm), return_inverse=True)
+    if not len(keys):
+        return np.zeros(len(places_mm), dtype=np.bool_)
+    use = np.flatnonzero(after.neighbours > 0)
+    near = (after.points_mm[use] >= places_mm.min(axis=0) - old.cell_mm).all(axis=1)
+    near &= (after.points_mm[use] <= places_mm.max(axis=0) + old.cell_mm).all(axis=1)
+    use = use[near]
+    at = np.searchsorted(keys, old.keys(after.points_mm[use]))
+    at = np.minimum(at, len(keys) - 1)
+    mine = keys[at] == old.keys(after.points_mm[use])
+    fails = after_report.judgement.fails[use[mine]]
+    points, failing = np.bincount(at[mine], minlength=len(keys)), np.bincount(at[mine], fails, len(keys))
+    good: BoolArray = (points > 0) & (failing < 0.5 * points)
+    return good[cell_of]
 
 
 def owners_of(done: RecommendedPass, places_mm: Float64Array, optics: ScannerOptics, within_mm: float) -> IntArray:

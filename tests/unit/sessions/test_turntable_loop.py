@@ -1,4 +1,4 @@
-"""The closed loop of a turntable that a client drives: a block is scanned all around, and its top is said to be lost."""
+"""The closed loop of a turntable that a client drives: a block is scanned all around, and its top is given up."""
 
 import math
 
@@ -31,7 +31,8 @@ BESIDE = Pose(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), n
 def turntable_setup():
     rig = Rig(stage_from_sensor=BESIDE, turntable=Turntable(AXIS, RADIUS_MM))
     limits = RigLimits(
-        AxisKind.TURNTABLE, (0.0, FULL_TURN_MM), (0.0, 200.0), (0.0, 200.0), SCANNER.geometry(), (-25.0, 25.0), RADIUS_MM
+        AxisKind.TURNTABLE, (0.0, FULL_TURN_MM), (0.0, 200.0), (0.0, 200.0), SCANNER.geometry(), (-25.0, 25.0),
+        RADIUS_MM,
     )  # fmt: skip
     motion = TurningMotion(rig.part_from_sensor(0.0), AXIS, RADIUS_MM)
     return RigSetup(Reach(limits, rig), OPTICS, motion, driven_by_client=True)
