@@ -4,21 +4,26 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.scannable import Allowed, CoverageTruth, sample_surface, scannable
-from drivers.rig_limits import AxisKind, RigLimits
-from drivers.scanline import Float64Array, Pose, Scanline
-from scanner_service.analysis.intake import quantise
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from benchmarks.rescan_scan import (
+    DENSITY_PER_MM2,
+    Run,
+    Scan,
+    Subject,
+    attitude,
+    raster_lanes,
+    reach_of,
+    subject_of,
+)
+from drivers.scanline import BoolArray, Float64Array, Pose
 from scanner_service.analysis.snapshot import MapSnapshot
-from scanner_service.rescan.passes.experience import chances_of, trust_of
+from scanner_service.rescan.passes.experience import chances_of
 from scanner_service.rescan.passes.looks import look_of
-from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.optics import ScannerOptics
 from scanner_service.rescan.passes.outcome import Outcome, reckon
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
@@ -27,119 +32,14 @@ from scanner_service.rescan.passes.recommendation import Plan, RecommendedPass
 from scanner_service.rescan.passes.tried import Tried
 from scanner_service.rescan.regions import RegionReport, find_regions
 from scanner_service.rescan.requirement import Requirement
-from simulators.meshes import load_mesh
 from simulators.optics import LaserLineScanner, demo_scanner
-from simulators.parts import PARTS, Part
-from simulators.posed_rig import PosedScanner
-from simulators.shapes import Surface
 
-DENSITY_PER_MM2 = 20.0
 FIRST_SPACING_MM = 0.35
 RASTER_SPACINGS_MM = (0.35, 0.28, 0.22, 0.17, 0.12)
 GOAL = 0.99
+LOST = 2.5
+"""Other ways are followed until they took this many times as long as the loop in all."""
 MAX_PASSES = 40
-MESHES = (("fandisk.obj", 50.0), ("gears.stl", 1.0), ("featuretype.STL", 20.0))
-
-
-@dataclass(frozen=True, slots=True)
-class Subject:
-    """A part to scan, with its box and its truth."""
-
-    name: str
-    surface: Surface
-    low_mm: Float64Array
-    high_mm: Float64Array
-    truth: Callable[[], CoverageTruth]
-
-
-@dataclass(slots=True)
-class Run:
-    """What one way of scanning did: after each pass its end in seconds and the coverage."""
-
-    way: str
-    seconds: list[float] = field(default_factory=list)
-    coverage: list[float] = field(default_factory=list)
-    promised_mm2: list[float] = field(default_factory=list)
-    reached_mm2: list[float] = field(default_factory=list)
-    true_gain_mm2: list[float] = field(default_factory=list)
-    planning_s: list[float] = field(default_factory=list)
-
-    def seconds_to(self, share: float) -> float:
-        """When the coverage was first `share`; inf: never. Within a pass it is not known, so its end counts."""
-        for at_s, covered in zip(self.seconds, self.coverage, strict=True):
-            if covered >= share:
-                return at_s
-        return math.inf
-
-
-class Scan:
-    """A part under a posed scanner: passes are driven, timed, mapped and counted."""
-
-    def __init__(
-        self, subject: Subject, reach: Reach, scanner: LaserLineScanner, with_map: bool, seed: int = 1
-    ) -> None:
-        self.reach = reach
-        self.truth = subject.truth()
-        self.run = Run("")
-        self.standing: Pose | None = None
-        self.map = LiveMap(MapSettings(noise_mm=scanner.noise_mm, max_points=8_000_000)) if with_map else None
-        self._posed = PosedScanner(scanner, subject.surface, np.random.default_rng(seed))
-        self._elapsed_s = 0.0
-        self.looks: list[tuple[StraightMotion, float, float]] = []
-
-    def drive(self, pose_at: Callable[[float], Pose], start_mm: float, end_mm: float, spacing_mm: float) -> None:
-        """Carry out one pass; time goes on by the way there and by the pass."""
-        begin = pose_at(start_mm)
-        self._elapsed_s += self.reach.seconds_between(self.standing, begin)
-        self._elapsed_s += self.reach.seconds(abs(end_mm - start_mm), spacing_mm)
-        self.standing = pose_at(end_mm)
-        self.looks.append((straight(pose_at), start_mm, end_mm))
-        lines: list[Scanline] = list(self._posed.scan(pose_at, start_mm, end_mm, spacing_mm))
-        self.truth.add(lines)
-        if self.map is not None:
-            for line in lines:
-                self.map.add(quantise(line, self.map.origin_mm))
-            self.map.close_all_passes()
-        self.run.seconds.append(self._elapsed_s)
-        self.run.coverage.append(self.truth.share)
-
-
-def subject_of(name: str, scanner: LaserLineScanner, max_tilt_rad: float, meshes: Path | None) -> Subject:
-    """A generated part by its name, or a mesh file, with its truth worked out once."""
-    scales = dict(MESHES)
-    if name in PARTS:
-        part: Part = PARTS[name]()
-        surface: Surface = part.surface
-        low, high = np.array([-24.0, -1.0, -7.0]), np.array([24.0, 61.0, 20.0])
-    else:
-        if meshes is None:
-            raise FileNotFoundError(f"the mesh {name} needs --meshes FOLDER")
-        loose = load_mesh(meshes / name, scales[name])
-        middle = 0.5 * (loose.bounds_mm[0] + loose.bounds_mm[1])
-        mesh = load_mesh(meshes / name, scales[name], Pose(np.eye(3), -middle))
-        surface = mesh
-        low, high = mesh.bounds_mm
-    rng = np.random.default_rng(7)
-    samples = sample_surface(surface, low, high, 6000, rng)
-    dense = sample_surface(surface, low, high, 150_000, rng)
-    allowed = Allowed(max_tilt_rad, math.radians(60.0), scanner.camera_angle_rad)
-    can = scannable(surface, samples, allowed)
-    return Subject(name, surface, low, high, lambda: CoverageTruth(samples, dense, can, DENSITY_PER_MM2))
-
-
-def reach_of(scanner: LaserLineScanner) -> Reach:
-    """A sensor on an arm above the part: up to 70 degrees from the vertical, 200 lines/s, 100 mm/s between passes."""
-    half = 0.5 * scanner.field_of_view_mm
-    limits = RigLimits(
-        AxisKind.FREE_POSE,
-        (-math.inf, math.inf),
-        (0.0, 200.0),
-        (0.0, 200.0),
-        scanner.geometry(),
-        (-half, half),
-        reach_mm=((-400.0, -400.0, -300.0), (400.0, 400.0, 400.0)),
-    )
-    return Reach(limits)
 
 
 def first_pass(scan: Scan, subject: Subject, scanner: LaserLineScanner) -> None:
@@ -148,55 +48,9 @@ def first_pass(scan: Scan, subject: Subject, scanner: LaserLineScanner) -> None:
         scan.drive(pose_at, start, end, FIRST_SPACING_MM)
 
 
-def raster_lanes(
-    subject: Subject, scanner: LaserLineScanner, rotation: Float64Array
-) -> Iterator[tuple[Callable[[float], Pose], float, float]]:
-    """Lanes that cover the part's box in one attitude."""
-    corners = np.array(
-        [[x, y, z] for x in (subject.low_mm[0], subject.high_mm[0]) for y in (subject.low_mm[1], subject.high_mm[1])
-         for z in (subject.low_mm[2], subject.high_mm[2])]
-    ) @ rotation  # fmt: skip
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    width = 0.8 * scanner.field_of_view_mm
-    depth = 0.9 * (scanner.range_mm[1] - scanner.range_mm[0])
-    forth = True
-    for x in _middles(float(low[0]), float(high[0]), width):
-        for z in _middles(float(low[2]), float(high[2]), depth):
-            at_zero = Pose(rotation.copy(), rotation @ np.array([x, 0.0, z]))
-
-            def pose_at(position_mm: float, at_zero: Pose = at_zero) -> Pose:
-                return Pose(at_zero.rotation.copy(), at_zero.translation_mm + position_mm * at_zero.rotation[:, 1])
-
-            ends = (float(low[1]), float(high[1]))
-            yield (pose_at, *(ends if forth else ends[::-1]))
-            forth = not forth
-
-
-def straight(pose_at: Callable[[float], Pose]) -> StraightMotion:
-    """The motion of a lane."""
-    return StraightMotion(pose_at(0.0), pose_at(1.0).translation_mm - pose_at(0.0).translation_mm)
-
-
-def _middles(low: float, high: float, width: float) -> list[float]:
-    count = max(1, math.ceil((high - low) / width - 1e-9))
-    step = (high - low) / count
-    return [low + (k + 0.5) * step for k in range(count)]
-
-
-def attitude(tilt_deg: float, azimuth_deg: float, roll_deg: float = 0.0) -> Float64Array:
-    """Rotation of a sensor tilted from the vertical towards an azimuth, and rolled about its own z."""
-
-    def about(axis: int, degrees: float) -> Float64Array:
-        a, b = (axis + 1) % 3, (axis + 2) % 3
-        turned = np.eye(3)
-        cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-        turned[a, a], turned[a, b], turned[b, a], turned[b, b] = cosine, -sine, sine, cosine
-        return turned
-
-    return about(2, azimuth_deg) @ about(1, tilt_deg) @ about(2, roll_deg)
-
-
-def uniform_raster(subject: Subject, reach: Reach, scanner: LaserLineScanner, spacing_mm: float) -> Run:
+def uniform_raster(
+    subject: Subject, reach: Reach, scanner: LaserLineScanner, spacing_mm: float, until_s: float = math.inf
+) -> Run:
     """The whole part at one spacing from above, then from all sides, steeper and steeper, until the goal or the end."""
     scan = Scan(subject, reach, scanner, with_map=False)
     scan.run.way = f"raster {spacing_mm:g} mm"
@@ -208,12 +62,14 @@ def uniform_raster(subject: Subject, reach: Reach, scanner: LaserLineScanner, sp
     for tilt, azimuth, roll in order:
         for pose_at, start, end in raster_lanes(subject, scanner, attitude(tilt, azimuth, roll)):
             scan.drive(pose_at, start, end, spacing_mm)
-        if scan.run.coverage[-1] >= GOAL:
+        if scan.run.coverage[-1] >= GOAL or scan.run.seconds[-1] > until_s:
             break
     return scan.run
 
 
-def at_random(subject: Subject, reach: Reach, scanner: LaserLineScanner, seed: int = 3) -> Run:
+def at_random(
+    subject: Subject, reach: Reach, scanner: LaserLineScanner, until_s: float = math.inf, seed: int = 3
+) -> Run:
     """Passes over the whole part from random allowed attitudes, after the first from above."""
     scan = Scan(subject, reach, scanner, with_map=False)
     scan.run.way = "random"
@@ -225,7 +81,7 @@ def at_random(subject: Subject, reach: Reach, scanner: LaserLineScanner, seed: i
             subject, scanner, attitude(tilt, rng.uniform(0.0, 360.0), rng.uniform(0.0, 360.0))
         ):
             scan.drive(pose_at, start, end, rng.choice(RASTER_SPACINGS_MM))
-        if scan.run.coverage[-1] >= GOAL:
+        if scan.run.coverage[-1] >= GOAL or scan.run.seconds[-1] > until_s:
             break
     return scan.run
 
@@ -282,7 +138,7 @@ def closed_loop(
     snapshot, report = judged(scan, scanner)
     plan: Plan | None = None
     for _ in range(MAX_PASSES):
-        wishes = Wishes(DENSITY_PER_MM2, max_passes=1, chances=chances_of(earlier), trust=trust_of(earlier))
+        wishes = Wishes(DENSITY_PER_MM2, max_passes=1, chances=chances_of(earlier))
         begun = time.perf_counter()
         looks = [look_of(snapshot, n, *one, scanner.points_per_line) for n, one in enumerate(scan.looks)]
         seen = tuple(look for look in looks if look is not None)
@@ -295,9 +151,10 @@ def closed_loop(
         scan.drive(chosen.motion.part_from_sensor, chosen.start_mm, chosen.end_mm, chosen.line_spacing_mm)
         was, was_report = snapshot, report
         snapshot, report = judged(scan, scanner)
-        outcome: Outcome = reckon(chosen, was, was_report, snapshot, report, wishes.cell_mm)
-        tried = tried.and_also(outcome.missed_mm)
+        outcome: Outcome = reckon(chosen, was, was_report, snapshot, report, optics)
+        tried = tried.and_also(outcome.missed_mm, outcome.empty_mm)
         earlier.append(outcome)
+        scan.run.explores.append(chosen.explores)
         scan.run.promised_mm2.append(outcome.promised_mm2)
         scan.run.reached_mm2.append(outcome.reached_mm2)
         scan.run.true_gain_mm2.append(scan.truth.met_mm2 - before)
@@ -307,7 +164,7 @@ def closed_loop(
 
 def _told(scan: Scan, chosen: RecommendedPass, outcome: Outcome, plan: Plan, reach: Reach) -> str:
     run = scan.run
-    kinds = ", ".join(f"{one.evidence.name.lower()} {one.kept_mm2:.0f}/{one.asked_mm2:.0f}" for one in outcome.kinds)
+    kinds = ", ".join(f"{one.evidence.name.lower()} {one.reached_mm2:.0f}/{one.asked_mm2:.0f}" for one in outcome.kinds)
     return (
         f"  pass {len(run.seconds)}: {run.seconds[-1]:.1f} s, {run.coverage[-1]:.2%}, promised "
         f"{outcome.promised_mm2:.0f}, reached {outcome.reached_mm2:.0f} and {outcome.besides_mm2:.0f} besides "
@@ -317,10 +174,31 @@ def _told(scan: Scan, chosen: RecommendedPass, outcome: Outcome, plan: Plan, rea
     )
 
 
-def promise_errors(run: Run) -> Float64Array:
-    """|reached - promised| / promised of each pass, by the service's own reckoning."""
-    promised = np.array(run.promised_mm2)
-    return np.asarray(np.abs(np.array(run.reached_mm2) - promised) / promised, dtype=np.float64)
+def _ended(run: Run) -> str:
+    return f"  {run.way}: {run.coverage[-1]:.2%} after {run.seconds[-1]:.1f} s"
+
+
+def promises_of(run: Run) -> dict[str, dict[str, float]]:
+    """How far reached was from promised, by the service's own reckoning: passes that promise, that explore, and all.
+
+    `median_error` is the median of |reached - promised| / promised over the passes.
+    """
+    promised, reached, explores = (np.array(one) for one in (run.promised_mm2, run.reached_mm2, run.explores))
+    found = {}
+    for name, mine in (("firm", ~explores), ("exploring", explores), ("all", np.ones(len(promised), dtype=np.bool_))):
+        found[name] = _errors(promised, reached, mine)
+    return found
+
+
+def _errors(promised_mm2: Float64Array, reached_mm2: Float64Array, mine: BoolArray) -> dict[str, float]:
+    promised, reached = promised_mm2[mine], reached_mm2[mine]
+    error = np.abs(reached - promised) / promised
+    return {
+        "passes": float(mine.sum()),
+        "promised_mm2": float(promised.sum()),
+        "reached_mm2": float(reached.sum()),
+        "median_error": float(np.median(error)) if len(error) else math.nan,
+    }
 
 
 def measure(name: str, meshes: Path | None, folder: Path, tell: Callable[[str], None]) -> dict[str, object]:
@@ -331,10 +209,13 @@ def measure(name: str, meshes: Path | None, folder: Path, tell: Callable[[str], 
     tell(f"{name}: {subject.truth().scannable_mm2:.0f} mm2 can be scanned")
     loop, _, plan = closed_loop(subject, reach, scanner, tell)
     runs = [loop]
+    until_s = LOST * loop.seconds[-1]
     for spacing in RASTER_SPACINGS_MM:
-        runs.append(uniform_raster(subject, reach, scanner, spacing))
-        tell(f"  {runs[-1].way}: {runs[-1].coverage[-1]:.2%} after {runs[-1].seconds[-1]:.1f} s")
-    runs += [at_random(subject, reach, scanner), largest_hole_first(subject, reach, scanner)]
+        runs.append(uniform_raster(subject, reach, scanner, spacing, until_s))
+        tell(_ended(runs[-1]))
+    runs += [at_random(subject, reach, scanner, until_s), largest_hole_first(subject, reach, scanner)]
+    for run in runs[-2:]:
+        tell(_ended(run))
     rasters = [run for run in runs if run.way.startswith("raster")]
     best_share = loop.coverage[-1]
     found = {
@@ -346,7 +227,7 @@ def measure(name: str, meshes: Path | None, folder: Path, tell: Callable[[str], 
         "seconds_to_99": loop.seconds_to(GOAL),
         "raster_seconds_to_99": min(run.seconds_to(GOAL) for run in rasters),
         "raster_seconds_to_same": min(run.seconds_to(best_share) for run in rasters),
-        "median_promise_error": float(np.median(promise_errors(loop))) if loop.promised_mm2 else math.nan,
+        "promises": promises_of(loop),
         "median_planning_s": float(np.median(loop.planning_s)),
         "unreachable_mm2": sum(one.area_mm2 for one in plan.unreachable) if plan else math.nan,
         "runs": [asdict(run) for run in runs],

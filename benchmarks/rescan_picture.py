@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.rescan_loop import DENSITY_PER_MM2, Scan, Subject, first_pass, judged, reach_of
+from benchmarks.rescan_loop import first_pass, judged
+from benchmarks.rescan_scan import DENSITY_PER_MM2, Scan, Subject, reach_of
 from drivers.scanline import Float64Array
 from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.needs import Evidence, Wanted, failing_points, find_needs

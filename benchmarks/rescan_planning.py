@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from benchmarks.rescan_loop import DENSITY_PER_MM2, reach_of, straight
+from benchmarks.rescan_scan import DENSITY_PER_MM2, reach_of, straight
 from drivers.scanline import Pose
 from scanner_service.analysis.intake import quantise
 from scanner_service.analysis.live_map import LiveMap, MapSettings

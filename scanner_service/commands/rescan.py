@@ -102,7 +102,9 @@ def _said(order: dict[str, Any]) -> str:
     if order["outcome"] is None:
         return f"{head}: {order['message'] or order['status']}"
     outcome = order["outcome"]
-    return f"{head}: promised {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²"
+    promised = "expected" if outcome["explores"] else "promised"
+    doubt = f"; warning: {outcome['doubt']}" if outcome["doubt"] else ""
+    return f"{head}: {promised} {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²{doubt}"
 
 
 def _tell_plan(plan: dict[str, Any]) -> None:
@@ -133,6 +135,7 @@ def _served(one: dict[str, Any]) -> str:
     named = [str(item["region"]) for item in one["serves"] if item["region"] is not None]
     regions = f"region{'s' if len(named) > 1 else ''} {', '.join(named)}" if named else ""
     unseen = "unseen surface" if len(named) < len(one["serves"]) else ""
+    unseen += " (explores: what is expected may not be there)" if one["explores"] else ""
     return " and ".join(filter(None, (regions, unseen))) or "nothing"
 
 

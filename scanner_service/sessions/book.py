@@ -330,17 +330,21 @@ class SessionBook:
             self._live = {}
 
     def _make_room(self) -> None:
-        """Close the session that was opened first among those that do not scan, nor will by themselves."""
+        """Close the session that was opened first among those that neither scan nor stand between two passes."""
         if len(self._live) + len(self._opening) < MAX_LIVE:
             return
         for session_id, session in self._live.items():
-            _, desk = self._desks.get(session_id, (session, None))
-            if session.state in OVER and not (desk is not None and desk.is_looping):
+            if session.state in OVER and not self._is_at_work(session_id):
                 session.close()
                 del self._live[session_id]
                 self._desks.pop(session_id, None)
                 return
         raise SessionBusy(f"{MAX_LIVE} sessions are scanning or waiting: stop one first")
+
+    def _is_at_work(self, session_id: str) -> bool:
+        """True for a session whose rescan loop or pass is under way."""
+        known = self._desks.get(session_id)
+        return known is not None and known[1].is_at_work
 
     def _all_rows(self) -> list[SessionRow]:
         rows: list[SessionRow] = []

@@ -113,7 +113,7 @@ def _step(desk: LoopDesk, loop: LoopState) -> str | None:
     desk.carry_out(order.order_id)
     loop.passes, loop.seconds = loop.passes + 1, loop.seconds + seconds
     desk.wait_for(order)
-    return order.message if order.status is PassStatus.FAILED else None
+    return order.message if order.status is PassStatus.FAILED else order.doubt
 
 
 def _fulfilled(results: Results, limits: LoopLimits) -> str | None:

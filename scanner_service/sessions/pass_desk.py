@@ -10,14 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from drivers.scanline import Pose
-from scanner_service.rescan.passes.experience import chances_of, trust_of
 from scanner_service.rescan.passes.guidance import Guidance, guide, reaches_end
-from scanner_service.rescan.passes.looks import Look, look_of
-from scanner_service.rescan.passes.motion import StraightMotion
-from scanner_service.rescan.passes.outcome import Outcome, reckon
-from scanner_service.rescan.passes.planner import Wishes, plan_passes
+from scanner_service.rescan.passes.outcome import reckon
 from scanner_service.rescan.passes.recommendation import Plan
-from scanner_service.rescan.passes.serving import EVERYTHING, Serving, number_of
+from scanner_service.rescan.passes.serving import EVERYTHING, Serving
 from scanner_service.rescan.passes.tried import Tried
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.closed_loop import LoopLimits, LoopState, run
@@ -33,6 +29,7 @@ from scanner_service.sessions.pass_orders import (
     accepted_event,
     outcome_event,
 )
+from scanner_service.sessions.pass_planning import PlanQuestion, driven_by, outcomes_of
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.rig_setups import RigSetup, is_driven, setup_of, start_pass
 from scanner_service.sessions.session import LiveSession
@@ -47,7 +44,11 @@ class PassDesk:
     def __init__(self, session: LiveSession, rigs: Path | None = None) -> None:
         self._session = session
         self._rigs = rigs  # the folder in which rig files lie
-        self._lock = threading.RLock()
+        self._lock = threading.RLock()  # held for moments only: whoever asks is answered at once
+        self._planning = threading.Lock()  # one plan is made at a time
+        self._starting = threading.RLock()  # one pass is started at a time
+        self._tasks = 0  # passes and loops under way
+        self._changes = 0  # of what plans are made from
         self._setup: RigSetup | None = None
         self._plan: Plan | None = None
         self._planned_for = EVERYTHING
@@ -64,7 +65,8 @@ class PassDesk:
     def describe_rig(self, setup: RigSetup) -> None:
         """State what the rig can do; passes planned before are forgotten."""
         with self._lock:
-            self._setup, self._plan = setup, None
+            self._setup = setup
+            self._changed()
 
     def plan(self, serving: Serving | None = None) -> Plan:
         """Recommended passes for the map as it is now; made anew only when the map or what is to be served has changed.
@@ -77,14 +79,12 @@ class PassDesk:
         PlanningError : the rig or the optics are not known.
         SessionError : the session is closed, or there is no such region.
         """
-        results = self._session.results() or self._session.fresh_results()
         serving = serving or EVERYTHING
-        with self._lock:
-            if self._plan is None or self._plan.version != results.report.version or self._planned_for != serving:
-                self._plan, self._planned_for = self._planned(results, serving), serving
-                if serving == EVERYTHING:
-                    self._mark(results, self._plan)
-            return self._plan
+        with self._planning:
+            plan, results = self._current_plan(serving)
+            if results is not None and serving == EVERYTHING:
+                self._mark(results, plan)
+            return plan
 
     def accept(self, number: int, serving: Serving | None = None) -> PassOrder:
         """Take an order for a pass of the latest plan.
@@ -107,7 +107,7 @@ class PassDesk:
 
     def cancel(self, order_id: int, why: str = "cancelled by the user") -> PassOrder:
         """Give an accepted pass up before it is carried out; raises PassUnknown, SessionBusy."""
-        with self._lock:
+        with self._starting, self._lock:  # one that is just being started is not cancelled any more
             order = self._orders.cancel(order_id, why)
             self._session.event(CANCELLED, {"order": order_id, "message": why})
         return order
@@ -127,13 +127,15 @@ class PassDesk:
         PlanningError : the rig cannot carry it out.
         SourceUnusable, DriverError : the pass could not be started.
         """
-        with self._lock:
-            order = self._orders.get(order_id)
+        with self._starting:
+            order = self.order(order_id)
             if order.status is not PassStatus.ACCEPTED:
                 raise SessionBusy(f"pass order {order_id} is {order.status.value}: accept a pass of a new plan")
+            self._task(+1)
             try:
                 before, setup = self._begun(order, part_is_turned)
             except Exception as error:
+                self._task(-1)
                 self.cancel(order_id, str(error))
                 raise
             order.status = PassStatus.RUNNING
@@ -146,28 +148,24 @@ class PassDesk:
     def run_loop(self, limits: LoopLimits) -> LoopState:
         """Plan and carry out by itself until nothing is left to do; raises SessionBusy while a loop runs."""
         self.plan(limits.serving)  # what cannot be planned is refused now, not in the loop
+        by_client = isinstance(self._session.source, PushSource) and self._setup_now().driven_by_client
         with self._lock:
-            if self.is_looping:
+            if self.loop is not None and self.loop.running:
                 raise SessionBusy("a closed loop is running already: end it first")
-            by_client = isinstance(self._session.source, PushSource) and self._setup_now().driven_by_client
             if not (by_client or is_driven(self._session)):
                 raise SessionBusy(
                     "a closed loop needs a rig that the service drives, or one that a client drives and is stated so "
                     "(driven_by_client); here passes are scanned by hand"
                 )
             loop = self.loop = LoopState(limits)
+            self._task(+1)
         threading.Thread(
             target=run,
-            args=(self, loop, lambda: self._session.event("loop_ended", loop.to_dict())),
+            args=(self, loop, lambda: self._loop_ended(loop)),
             name=f"rescan-{self._session.row.session_id}",
             daemon=True,
         ).start()
         return loop
-
-    @property
-    def is_looping(self) -> bool:
-        """True while a closed loop runs, between two of its passes too."""
-        return self.loop is not None and self.loop.running
 
     def end_loop(self) -> None:
         """End the closed loop after the pass that is under way."""
@@ -199,6 +197,11 @@ class PassDesk:
         laser = self._setup_now().optics.geometry.laser_mm
         return guide(order.planned, laser, line.laser_mm, line.plane_normal, speed)
 
+    @property
+    def is_at_work(self) -> bool:
+        """True while a pass is started, carried out or reckoned up, or a closed loop runs."""
+        return self._tasks > 0
+
     # -- what the closed loop asks ------------------------------------------------------------------------------
 
     def judged(self) -> Results:
@@ -213,10 +216,49 @@ class PassDesk:
     # -- inside -------------------------------------------------------------------------------------------------
 
     def _setup_now(self, results: Results | None = None) -> RigSetup:
-        if self._setup is None:
+        with self._lock:
+            known = self._setup
+        if known is None:
             results = results or self._session.results() or self._session.fresh_results()
-            self._setup = setup_of(self._session, results.snapshot, self._rigs)
-        return self._setup
+            found = setup_of(self._session, results.snapshot, self._rigs)
+            with self._lock:  # what was stated meanwhile counts
+                known = self._setup = self._setup or found
+        return known
+
+    def _task(self, more: int) -> None:
+        """One pass or loop more, or less, is under way."""
+        with self._lock:
+            self._tasks += more
+
+    def _loop_ended(self, loop: LoopState) -> None:
+        try:
+            self._session.event("loop_ended", loop.to_dict())
+        finally:
+            self._task(-1)
+
+    def _changed(self) -> None:
+        """What is planned from is not what it was; the lock is held."""
+        self._plan, self._changes = None, self._changes + 1
+
+    def _current_plan(self, serving: Serving) -> tuple[Plan, Results | None]:
+        """The plan for the map as it is, and the verdict it was made from where it was made just now.
+
+        It is made without the lock, so that whoever asks meanwhile of orders is answered; made again when what it was
+        made from has changed meanwhile.
+        """
+        while True:
+            results = self._session.results() or self._session.fresh_results()
+            setup = self._setup_now(results)
+            with self._lock:
+                known, changes = self._plan, self._changes
+                if known is not None and known.version == results.report.version and self._planned_for == serving:
+                    return known, None
+                question = self._question(results, setup, serving)
+            plan = question.answered()
+            with self._lock:
+                if self._changes == changes:
+                    self._plan, self._planned_for = plan, serving
+                    return plan, results
 
     def _begun(self, order: PassOrder, part_is_turned: bool) -> tuple[Results, RigSetup]:
         """Start the pass of an order; the verdict before it, and the rig that it goes with. Raises as `carry_out`."""
@@ -238,34 +280,11 @@ class PassDesk:
         start_pass(self._session, planned, self._rigs)
         return before, setup
 
-    def _planned(self, results: Results, serving: Serving) -> Plan:
-        setup = self._setup_now(results)
-        open_ids = {number_of(region) for region in results.regions}
-        unknown = sorted(serving.regions - open_ids)
-        if unknown:
-            raise PassUnknown(f"no region {unknown[0]} is open in this session; list the regions again")
-        required = results.requirement.density_per_mm2
-        if required is None:
-            required = float(np.nanmedian(results.report.judgement.required_per_mm2)) if len(results.snapshot) else 1.0
-        earlier = self._outcomes()
-        wishes = Wishes(
-            required,
-            chances=chances_of(earlier),
-            trust=trust_of(earlier),
-            requirement=results.requirement,
-            serving=serving,
-        )
-        return plan_passes(
-            results.snapshot,
-            results.report,
-            setup.reach,
-            setup.optics,
-            wishes,
-            self._standing,
-            self._tried,
-            self._looks(results, setup),
-            results.regions,
-            results.reference,
+    def _question(self, results: Results, setup: RigSetup, serving: Serving) -> PlanQuestion:
+        """What is planned from now; the lock is held."""
+        orders = self._orders.all()
+        return PlanQuestion(
+            results, setup, serving, outcomes_of(orders), self._tried, self._standing, driven_by(orders)
         )
 
     def _mark(self, results: Results, plan: Plan) -> None:
@@ -284,40 +303,13 @@ class PassDesk:
             except SessionError as error:  # it was mended meanwhile
                 _LOG.info("region %d was not marked: %s", region.region_id, error)
 
-    def _outcomes(self) -> list[Outcome]:
-        """What became of the passes that were carried out to their end, the oldest first."""
-        done = [one.outcome for one in self._orders.all() if one.teaches]
-        return [outcome for outcome in done if outcome is not None]
-
-    def _looks(self, results: Results, setup: RigSetup) -> tuple[Look, ...]:
-        """The passes whose poses are known: those that were ordered, and the session's own."""
-        snapshot = results.snapshot
-        driven = [
-            (number, order.planned.motion, order.planned.start_mm, order.planned.end_mm)
-            for order in self._orders.all()
-            for number in order.map_passes
-        ]
-        own = setup.scanned_by
-        if isinstance(own, StraightMotion):
-            ordered = {number for number, *_ in driven}
-            for number in sorted(set(snapshot.lines.pass_number.tolist()) - ordered):
-                at = snapshot.lines.position_mm[snapshot.lines.pass_number == number]
-                if len(at) and np.isfinite(at).all():
-                    driven.append((number, own, float(at[0]), float(at[-1])))
-        found = [
-            look_of(snapshot, number, motion, start_mm, end_mm, setup.optics.rays)
-            for number, motion, start_mm, end_mm in driven
-            if isinstance(motion, StraightMotion)
-        ]
-        return tuple(look for look in found if look is not None)
-
     def _learn(self, order: PassOrder) -> None:
         """Take in where the sensor stands after a pass, and what it was in vain for.
 
         A pass that failed or was stopped was in vain for nothing, and where it ended is not known.
         """
         if order.teaches and order.outcome is not None:
-            self._tried = self._tried.and_also(order.outcome.missed_mm)
+            self._tried = self._tried.and_also(order.outcome.missed_mm, order.outcome.empty_mm)
             self._standing = order.planned.end_pose
         elif order.status in (PassStatus.DONE, PassStatus.FAILED):
             self._standing = None
@@ -327,7 +319,7 @@ class PassDesk:
         try:
             self._session.wait_until_over()
             after = self._session.fresh_results()
-            outcome = reckon(order.planned, before.snapshot, before.report, after.snapshot, after.report)
+            outcome = reckon(order.planned, before.snapshot, before.report, after.snapshot, after.report, setup.optics)
             with self._lock:
                 fresh = set(after.snapshot.lines.pass_number.tolist()) - set(before.snapshot.lines.pass_number.tolist())
                 order.map_passes = sorted(fresh)
@@ -335,7 +327,7 @@ class PassDesk:
                 taken = np.isin(after.snapshot.lines.pass_number, order.map_passes) & ~after.snapshot.lines.stationary
                 laser_mm = setup.optics.geometry.laser_mm
                 order.reached_end = reaches_end(order.planned, laser_mm, after.snapshot.lines.laser_mm[taken])
-                self._plan = None
+                self._changed()
                 failed = self._session.state == "failed"
                 order.message = self._session.status().message if failed else None
                 order.status = PassStatus.FAILED if failed else PassStatus.DONE
@@ -347,4 +339,5 @@ class PassDesk:
                 self._learn(order)
             self._session.event(OUTCOME, outcome_event(order))
         finally:
+            self._task(-1)
             order.done.set()

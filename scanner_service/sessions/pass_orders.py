@@ -59,9 +59,14 @@ class PassOrder:
 
     @property
     def teaches(self) -> bool:
-        """True when it was carried out to its end: what it did not bring is not there to be had."""
+        """True when it was carried out as planned, to its end: what it did not bring is not there to be had."""
         went = self.reached_end if self.reached_end is not None else bool(self.map_passes)
-        return self.status is PassStatus.DONE and self.outcome is not None and went
+        return self.status is PassStatus.DONE and self.outcome is not None and self.doubt is None and went
+
+    @property
+    def doubt(self) -> str | None:
+        """Why its points seem to lie elsewhere than where they were measured; None when they do not."""
+        return self.outcome.doubt if self.outcome is not None else None
 
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
@@ -154,5 +159,7 @@ def outcome_event(order: PassOrder) -> dict[str, Any]:
     """What the record keeps of an order that is over, its missed places included."""
     told = order.to_dict()
     if order.outcome is not None:
-        told["outcome"] = order.outcome.to_dict() | {"missed_mm": order.outcome.missed_mm.round(2).tolist()}
+        told["outcome"] = order.outcome.to_dict() | {
+            name: getattr(order.outcome, name).round(2).tolist() for name in ("missed_mm", "empty_mm")
+        }
     return told | {"map_passes": order.map_passes}

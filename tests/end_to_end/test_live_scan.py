@@ -232,7 +232,9 @@ def test_a_source_that_cannot_be_used_is_refused_in_one_sentence(service, runnin
     assert service.client.get("/api/v1/sessions").json()["sessions"] == before
 
 
-def test_a_port_in_use_is_refused_by_the_session_that_holds_it_and_a_pass_that_cannot_be_lets_go_of_it(service, running):
+def test_a_port_in_use_is_refused_by_the_session_that_holds_it_and_a_pass_that_cannot_be_lets_go_of_it(
+    service, running
+):
     simulator = running.simulator("plate")
     first = service.create(**device(simulator, end_mm=4000.0))  # only the scanner knows how far its stage goes
     answer = service.client.post("/api/v1/sessions", json={"source": device(simulator)})

@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.scanline import Float64Array, Pose
 from scanner_service.rescan.passes.motion import Motion, StraightMotion, TurningMotion
-from scanner_service.rescan.passes.needs import Evidence
+from scanner_service.rescan.passes.needs import FIRST_CHANCES, Evidence
 from scanner_service.rescan.passes.reach import PartTurn
 from scanner_service.rescan.passes.recommendation import Promise, RecommendedPass, pose_dict
 
@@ -40,7 +40,6 @@ def keep_pass(one: RecommendedPass) -> dict[str, Any]:
         "places": base64.b64encode(rows.astype("<f4").tobytes()).decode("ascii"),
         "turn": None if one.turn is None else [one.turn.about_vertical_rad, one.turn.tip_rad],
         "chances": list(one.chances),
-        "trust": one.trust,
     }
 
 
@@ -61,12 +60,13 @@ def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
     numbers = {
         name: float(kept[name])
         for name in (
-            "start_mm", "end_mm", "line_spacing_mm", "line_rate_hz", "duration_s", "approach_s", "trust",
+            "start_mm", "end_mm", "line_spacing_mm", "line_rate_hz", "duration_s", "approach_s",
         )
     }  # fmt: skip
     turn, chances = kept["turn"], tuple(map(float, kept["chances"]))
-    if len(chances) != len(Evidence):
+    if len(chances) > len(Evidence):
         raise ValueError(f"a kept pass has {len(chances)} chances, and there are {len(Evidence)} kinds of evidence")
+    chances += FIRST_CHANCES[len(chances) :]  # of a time when fewer kinds were told apart
     return RecommendedPass(
         number=int(kept["number"]),
         motion=kept_motion(kept["motion"]),

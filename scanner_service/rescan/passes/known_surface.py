@@ -13,7 +13,16 @@ import numpy.typing as npt
 from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.looks import Look, mark_empty
-from scanner_service.rescan.passes.marching import SURFACE, carve, fill_pockets, gather, open_faces, outward, surrounded
+from scanner_service.rescan.passes.marching import (
+    HIDDEN,
+    SURFACE,
+    carve,
+    fill_pockets,
+    gather,
+    open_faces,
+    outward,
+    share_around,
+)
 from scanner_service.rescan.passes.optics import ScannerOptics
 from scanner_service.rescan.passes.solid import set_nominal
 from scanner_service.rescan.reference import Pieces
@@ -36,7 +45,8 @@ class KnownSurface:
     `points_mm`, `normals` (m, 3; unit, towards the laser), `area_mm2`, `count`, `failing_share` (m,) and `region` (m,),
     the number that failing points gave (0: none); `two_sided` (m,) where both sides of a thin wall were seen.
     `frontier_mm`, `frontier_normals` (f, 3) and `frontier_mm2` (f,) are where hidden space begins: surface that no
-    point has touched may be there. `frontier_solid` (f,) is the share of what is solid or hidden around.
+    point has touched may be there. `frontier_solid` (f,) is the share of what is solid or hidden around, and
+    `frontier_emptied` (f,) that of what passes have looked into in vain.
     """
 
     low_mm: Float64Array
@@ -53,6 +63,7 @@ class KnownSurface:
     frontier_normals: Float64Array
     frontier_mm2: Float64Array
     frontier_solid: Float64Array
+    frontier_emptied: Float64Array
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -118,10 +129,13 @@ def know_surface(
     if nominal is not None:
         set_nominal(state, low, side, nominal)
     open_cells, gradient = _frontier(state)
+    freed = state == HIDDEN
     if looks and optics is not None and mark_empty(state, low, side, looks, optics, open_cells, gradient):
         open_cells, gradient = _frontier(state)
-    solid = np.zeros(len(open_cells))
-    surrounded(state, open_cells, solid)
+    freed &= state != HIDDEN
+    solid, emptied = np.zeros(len(open_cells)), np.zeros(len(open_cells))
+    share_around(state >= HIDDEN, open_cells, solid)
+    share_around(freed, open_cells, emptied)
     return KnownSurface(
         low_mm=low,
         cell_mm=side,
@@ -137,6 +151,7 @@ def know_surface(
         frontier_normals=gradient,
         frontier_mm2=side * side / np.maximum(np.abs(gradient).max(axis=1, initial=0.5), 0.5),
         frontier_solid=solid,
+        frontier_emptied=emptied,
     )
 
 
@@ -191,5 +206,5 @@ def _nothing() -> KnownSurface:
     return KnownSurface(
         np.zeros(3), LEAST_CELL_MM, np.zeros((1, 1, 1), dtype=np.uint8), none, none.copy(), flat, whole, flat.copy(),
         whole.copy(), np.zeros(0, dtype=np.bool_), none.copy(), none.copy(), flat.copy(),
-        flat.copy(),
+        flat.copy(), flat.copy(),
     )  # fmt: skip

@@ -9,6 +9,9 @@ UNTOUCHED, FREE, HIDDEN, SURFACE = 0, 1, 2, 3
 CLEAR = 1.6
 """Cells that a sight goes before anything is in its way: beside an inner edge the other wall begins that near."""
 
+AIR = 2
+"""So many cells around a point must rays have gone through before it hangs in the air."""
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def first_stop(state, low, cell, x, y, z, dx, dy, dz, start, end):
@@ -36,6 +39,36 @@ def first_stop(state, low, cell, x, y, z, dx, dy, dz, start, end):
         else:
             at, mk, k = mk, mk + tk, k + sk
     return np.inf
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def first_known(state, low, cell, lasers, way, enters, leaves, points, first, in_air):
+    """The flat index of the SURFACE cell that stops each ray first (-1: another or none), and who hangs in air."""
+    ni, nj, nk = state.shape
+    for n in range(len(points)):
+        i = math.floor((points[n, 0] - low[0]) / cell)
+        j = math.floor((points[n, 1] - low[1]) / cell)
+        k = math.floor((points[n, 2] - low[2]) / cell)
+        if AIR <= i < ni - AIR and AIR <= j < nj - AIR and AIR <= k < nk - AIR:
+            alone = True
+            for a in range(-AIR, AIR + 1):
+                for b in range(-AIR, AIR + 1):
+                    for c in range(-AIR, AIR + 1):
+                        alone &= state[i + a, j + b, k + c] == FREE
+            in_air[n] = alone
+        if enters[n] >= leaves[n]:
+            continue
+        x, y, z = lasers[n, 0], lasers[n, 1], lasers[n, 2]
+        dx, dy, dz = way[n, 0], way[n, 1], way[n, 2]
+        stop = first_stop(state, low, cell, x, y, z, dx, dy, dz, enters[n], leaves[n])
+        if stop == np.inf:
+            continue
+        stop += 1e-6
+        i = math.floor((x + stop * dx - low[0]) / cell)
+        j = math.floor((y + stop * dy - low[1]) / cell)
+        k = math.floor((z + stop * dz - low[2]) / cell)
+        if 0 <= i < ni and 0 <= j < nj and 0 <= k < nk and state[i, j, k] == SURFACE:
+            first[n] = (i * nj + j) * nk + k
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -168,17 +201,16 @@ def outward(state, cells, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def surrounded(state, cells, out):
-    """Share (m,) of the cells within three of each of some cells (m, 3) that are HIDDEN or SURFACE."""
-    ni, nj, nk = state.shape
+def share_around(mask, cells, out):
+    """Share (m,) of the cells within three of each of some cells (m, 3) that are in a mask of the grid's shape."""
+    ni, nj, nk = mask.shape
     for n in range(len(cells)):
-        solid = 0
+        inside = 0
         for i in range(max(0, cells[n, 0] - 3), min(ni, cells[n, 0] + 4)):
             for j in range(max(0, cells[n, 1] - 3), min(nj, cells[n, 1] + 4)):
                 for k in range(max(0, cells[n, 2] - 3), min(nk, cells[n, 2] + 4)):
-                    if state[i, j, k] >= HIDDEN:
-                        solid += 1
-        out[n] = solid / 343.0
+                    inside += mask[i, j, k]
+        out[n] = inside / 343.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -26,7 +26,11 @@ _OTHER_SIDE = -0.5  # cosine between normals beyond which two places are the two
 _THROUGH = 2.8  # cells: how thick a wall may be of which one side is told by the other
 _AROUND = 24
 _BARE = 0.25  # a region is rarely a square around its middle
-_SURE = 0.6  # share of solid cells around from which on hidden space is taken to begin with surface
+_FAR_MM = 4.0  # further than this from known surface hidden space is an empty shadow more often
+_EMPTIED = 0.05  # share of emptied cells around from which on hidden space is a rest
+_SURE = 0.6  # share of solid cells around from which on a rest is taken to begin with surface ...
+_RARE = 0.4  # ... and up to which it rarely does: an edge of a shadow, or a thin rest
+_LEAST_SURE = 0.1
 _ANOTHER = 0.7  # a noisy place is looked at from at most this share of the angle at which it was noisy
 _HEAD_ON_RAD = math.radians(20.0)  # ... and nearer to the normal than this no direction is better
 _OUTNUMBER = 1.25
@@ -39,14 +43,22 @@ class Evidence(IntEnum):
 
     MEASURED = 0  # there are points, but they do not meet the requirement
     FLOOR = 1  # behind a jump in range the far surface goes on
-    FRONTIER = 2  # hidden space begins here
+    FRONTIER = 2  # hidden space begins here, beside known surface
     REFERENCE = 3  # the nominal part says so
     BEYOND = 4  # hidden space goes on beyond the outermost points
+    FAR = 5  # hidden space begins here, far from all that is known
+    REST = 6  # hidden space that is left beside what passes have looked into in vain
 
+
+HIDDEN_KINDS = (Evidence.FRONTIER, Evidence.BEYOND, Evidence.FAR, Evidence.REST)
+"""Hidden space is taken to begin with surface."""
+
+FIRM_KINDS = (Evidence.MEASURED, Evidence.FLOOR, Evidence.REFERENCE, Evidence.FRONTIER)
+"""What proved true about as far as it was counted on, on parts of many kinds; the rest is explored."""
 
 Chances = tuple[float, ...]
-"""How likely a place is what it seems, by `Evidence`; of hidden space before its edges are counted for less."""
-FIRST_CHANCES: Chances = (1.0, 0.9, 1.2, 0.9, 1.2)
+"""Good surface for each mm² that is believed in, by `Evidence`; of hidden space before edges are counted for less."""
+FIRST_CHANCES: Chances = (1.0, 1.0, 1.2, 0.9, 1.0, 0.8, 0.7)
 """... before a pass has shown it."""
 
 
@@ -175,7 +187,7 @@ def find_needs(
         np.concatenate(pair) for pair in zip(found, bare, strict=True)
     )  # fmt: skip
     n = len(area)
-    chance = np.minimum(np.array(chances)[evidence] * sure, 1.0)
+    chance = np.array(chances)[evidence] * sure
     needs = Needs(
         places, normals, area, region, evidence, np.full(n, wanted.density_per_mm2), chance,
         np.full(n, wanted.line_spacing_mm), np.full(n, wanted.incidence_rad),
@@ -234,14 +246,23 @@ def _floors(
 
 
 def _frontier(surface: KnownSurface) -> Columns:
-    """Where hidden space begins; it belongs to no region. Edges and thin rests of it are rarely surface."""
+    """Where hidden space begins; it belongs to no region.
+
+    What is left of it where passes looked in vain is rarely surface at its edges and where it is thin.
+    """
     n = len(surface.frontier_mm2)
-    sure = np.minimum(1.0, surface.frontier_solid / _SURE) ** 2
+    sure = np.ones(n)
     kind = np.full(n, Evidence.FRONTIER, dtype=np.int64)
     if len(surface.points_mm):
+        away, _ = cKDTree(surface.points_mm).query(surface.frontier_mm, distance_upper_bound=_FAR_MM)
+        kind[~np.isfinite(away)] = Evidence.FAR
         low, high = surface.points_mm.min(axis=0), surface.points_mm.max(axis=0)
         off = np.maximum(low - surface.frontier_mm, surface.frontier_mm - high).max(axis=1)
         kind[off > 0.5 * surface.cell_mm] = Evidence.BEYOND
+        rest = surface.frontier_emptied > _EMPTIED
+        kind[rest] = Evidence.REST
+        solid = (surface.frontier_solid[rest] - _RARE) / (_SURE - _RARE)
+        sure[rest] = np.clip(solid, _LEAST_SURE, 1.0)
     none = np.full(n, UNSEEN, dtype=np.int64)
     return surface.frontier_mm, surface.frontier_normals, surface.frontier_mm2, none, kind, sure
 
@@ -334,7 +355,7 @@ def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, e
         keep[guessed] = ~is_near | (other_side & ~seen)
     keep[_in_the_air(surface, places, normals) & (evidence == Evidence.FLOOR)] = False
     floors = np.flatnonzero((evidence == Evidence.FLOOR) & keep)
-    frontier = np.flatnonzero(np.isin(evidence, (Evidence.FRONTIER, Evidence.BEYOND)) & keep)
+    frontier = np.flatnonzero(np.isin(evidence, HIDDEN_KINDS) & keep)
     if len(floors) and len(frontier):
         near, _ = cKDTree(places[floors]).query(places[frontier], distance_upper_bound=surface.cell_mm)
         keep[frontier] = ~np.isfinite(near)

@@ -42,8 +42,8 @@ class Wishes:
 
     `requirement` asks for more than a density: line spacing, chord error, incidence. `serving` names what is to be
     served; unseen surface only when nothing is named. `explore` reckons with surface where hidden space begins,
-    outside of any region. `chances` are how likely each kind of evidence has proved (`experience.chances_of`), `trust`
-    how much good surface there was for each mm² that was there as foretold (`experience.trust_of`).
+    outside of any region. `chances` are how much good surface each kind of evidence has proved to bring
+    (`experience.chances_of`).
     """
 
     density_per_mm2: float
@@ -52,7 +52,6 @@ class Wishes:
     explore: bool = True
     chances: Chances = FIRST_CHANCES
     cell_mm: float | None = None
-    trust: float = 1.0
     requirement: Requirement | None = None
     serving: Serving = EVERYTHING
 
@@ -89,7 +88,6 @@ def plan_passes(
     wanted = Wanted.of(wishes.density_per_mm2, wishes.requirement)
     explore = wishes.explore and wishes.serving.is_everything
     needs = find_needs(snapshot, report, surface, wanted, wishes.chances, explore, regions, missing)
-    needs = needs.changed(chance=wishes.trust * needs.chance)
     if not wishes.serving.is_everything:
         named = [number_of(one) for one in regions if wishes.serving.wants(one)]
         needs = needs.only(np.isin(needs.region, named))
@@ -159,5 +157,4 @@ def _recommend(
         place_normals=needs.normals[served],
         turn=choice.attitude.turn,
         chances=wishes.chances,
-        trust=wishes.trust,
     )

@@ -9,8 +9,10 @@ import numpy as np
 from drivers.rig_limits import lines_between
 from drivers.scanline import Float64Array, Pose, read_only
 from scanner_service.rescan.passes.motion import Motion, StraightMotion
-from scanner_service.rescan.passes.needs import FIRST_CHANCES, UNSEEN, Chances
+from scanner_service.rescan.passes.needs import FIRM_KINDS, FIRST_CHANCES, UNSEEN, Chances
 from scanner_service.rescan.passes.reach import PartTurn
+
+_UNTRIED = 0.5  # of what its kind promises: less is left of a place that a pass was in vain for
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +47,8 @@ class RecommendedPass:
     `promises` what it is to give, region by region; `gain_mm2` their sum. `places_mm` (k, 3) are the places served,
     `place_regions` (k,) their regions, `place_evidence` (k,) why they are believed in, `place_area_mm2` (k,) their
     areas, `place_mm2` (k,) what of these is promised, and `place_normals` (k, 3) where they face; they are kept for the
-    reckoning afterwards. `turn` is what the operator does first; `chances` (by evidence) and `trust` are what
-    the promises were multiplied by, from earlier outcomes.
+    reckoning afterwards. `turn` is what the operator does first; `chances` (by evidence) are what the
+    promises were multiplied by, from earlier outcomes.
     """
 
     number: int
@@ -66,7 +68,6 @@ class RecommendedPass:
     place_normals: Float64Array
     turn: PartTurn | None = None
     chances: Chances = FIRST_CHANCES
-    trust: float = 1.0
 
     def __post_init__(self) -> None:
         for array in (
@@ -79,6 +80,20 @@ class RecommendedPass:
     def gain_mm2(self) -> float:
         """Surface that is to meet the requirement afterwards and does not now."""
         return sum(promise.gain_mm2 for promise in self.promises)
+
+    @property
+    def explores_mm2(self) -> float:
+        """What of the gain is expected of hidden space that may well be empty; the rest of it is a firm promise."""
+        firm = np.isin(self.place_evidence, FIRM_KINDS)
+        untried = (
+            self.place_mm2 > _UNTRIED * self.place_area_mm2 * np.array(self.chances)[self.place_evidence.astype(int)]
+        )
+        return float(self.place_mm2[~(firm & untried)].sum())
+
+    @property
+    def explores(self) -> bool:
+        """True where most of what is expected is no firm promise: the pass is made to see what is there."""
+        return self.explores_mm2 > 0.5 * self.gain_mm2
 
     @property
     def gain_per_s(self) -> float:
@@ -126,6 +141,8 @@ class RecommendedPass:
             "laser_direction": (-self.start_pose.rotation[:, 2]).tolist(),
             "turn_part": None if self.turn is None or self.turn.is_none else str(self.turn),
             "gain_mm2": self.gain_mm2,
+            "explores_mm2": self.explores_mm2,
+            "explores": self.explores,
             "gain_per_s_mm2": self.gain_per_s,
             "serves": [promise.to_dict() for promise in self.promises],
         }

@@ -7,13 +7,17 @@ import time
 import numpy as np
 import pytest
 
+from drivers.rig_limits import AxisKind
 from scanner_service.rescan.passes.errors import RigUnlimited
 from scanner_service.rescan.passes.needs import FIRST_CHANCES
+from scanner_service.rescan.passes.outcome import Outcome
+from scanner_service.rescan.passes.planner import plan_passes
 from scanner_service.rescan.passes.serving import Serving
 from scanner_service.rescan.passes.tried import TRIES
 from scanner_service.rescan.region import RegionStatus
+from scanner_service.sessions import pass_planning
 from scanner_service.sessions.book import SessionBook
-from scanner_service.sessions.closed_loop import LoopLimits, LoopState
+from scanner_service.sessions.closed_loop import LoopLimits
 from scanner_service.sessions.errors import PassUnknown, SessionBusy
 from scanner_service.sessions.pass_orders import PassStatus
 from scanner_service.sessions.rig_setups import RigSetup
@@ -92,6 +96,79 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
     ]
 
 
+def test_orders_are_answered_while_a_plan_is_made(book, scanned, monkeypatch):
+    session, _ = scanned
+    desk = book.pass_desk(session)
+    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    accepted = desk.accept(1)
+    begun, answered, waited = threading.Event(), threading.Event(), []
+
+    def slow_plan(*arguments):
+        begun.set()
+        waited.append(answered.wait(120))
+        return plan_passes(*arguments)
+
+    monkeypatch.setattr(pass_planning, "plan_passes", slow_plan)
+    desk.describe_rig(RigSetup(free_reach(), OPTICS))  # plans anew
+    plans = []
+    planner = threading.Thread(target=lambda: plans.append(desk.plan()))
+    planner.start()
+    assert begun.wait(120)
+    assert desk.orders() == [accepted] and desk.order(1) is accepted
+    assert desk.cancel(1).status is PassStatus.CANCELLED
+    answered.set()
+    planner.join(300)
+    assert waited == [True]  # the plan was still being made when all of these were answered
+    assert plans[0].passes
+
+
+def test_a_plan_that_is_overtaken_by_another_rig_is_made_again(book, scanned, monkeypatch):
+    session, _ = scanned
+    desk = book.pass_desk(session)
+    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    reaches = []
+
+    def overtaken(snapshot, report, reach, *others):
+        reaches.append(reach)
+        if len(reaches) == 1:
+            desk.describe_rig(RigSetup(linear_reach(), OPTICS))
+        return plan_passes(snapshot, report, reach, *others)
+
+    monkeypatch.setattr(pass_planning, "plan_passes", overtaken)
+    plan = desk.plan()
+    assert [reach.limits.axis for reach in reaches] == [AxisKind.FREE_POSE, AxisKind.LINEAR]
+    assert all(np.allclose(one.direction, FROM_ABOVE.travel) for one in plan.passes)
+
+
+def test_a_session_between_two_passes_is_not_closed_to_make_room(book, scanned, monkeypatch):
+    session, posed = scanned
+    desk = book.pass_desk(session)
+    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    order = desk.accept(1)
+    desk.carry_out(order.order_id)
+    push(session, posed, FROM_ABOVE, -1.0, 1.0, 1.0)
+    begun, may_judge = threading.Event(), threading.Event()
+    fresh_results = session.fresh_results
+
+    def late_verdict():
+        begun.set()
+        may_judge.wait(120)
+        return fresh_results()
+
+    monkeypatch.setattr(session, "fresh_results", late_verdict)
+    session.stop()
+    assert begun.wait(120) and session.state == "stopped" and desk.is_at_work
+    monkeypatch.setattr("scanner_service.sessions.book.MAX_LIVE", 1)
+    with pytest.raises(SessionBusy, match="stop one first"):
+        book.create("another", PushSpec())
+    assert book.live(session.row.session_id) is session
+    may_judge.set()
+    desk.wait_for(order)
+    assert not desk.is_at_work
+    book.create("another", PushSpec())
+    assert book.live(session.row.session_id) is None
+
+
 def test_without_limits_of_the_rig_nothing_is_planned(book, scanned):
     with pytest.raises(RigUnlimited, match="state its limits"):
         book.pass_desk(scanned[0]).plan()
@@ -125,6 +202,44 @@ def test_a_part_that_must_be_turned_waits_for_its_operator(book, scanned):
     assert order.status is PassStatus.RUNNING  # one that runs is not cancelled by a second request
     session.stop()
     desk.wait_for(order)
+
+
+def test_a_turned_pass_over_a_part_that_was_not_turned_is_doubted_until_it_is_withdrawn(book, scanned, tmp_path):
+    session, posed = scanned
+    desk = book.pass_desk(session)
+    desk.describe_rig(RigSetup(dataclasses.replace(linear_reach(part_may_turn=True), turn_part_s=0.1), OPTICS))
+
+    def turned_pass(motion_of, placed):
+        order = desk.accept(next(one.number for one in desk.plan().passes if one.to_dict()["turn_part"]))
+        desk.carry_out(order.order_id, part_is_turned=True)
+        one = order.planned
+        lines = posed.scan(motion_of(one).part_from_sensor, one.start_mm, one.end_mm, one.line_spacing_mm)
+        sent = [placed(one.motion.at_zero, line) for line in lines]
+        for reply in [session.push(line) for line in sent]:
+            reply.result(120)
+        session.stop()
+        desk.wait_for(order)
+        return order, (sent[0].device_id, sent[0].boot_id, sent[0].pass_index)
+
+    def elsewhere(pose, line):  # the rig believes that the part is turned
+        moved = {"points_mm": pose.apply(line.points_mm), "laser_mm": pose.apply(line.laser_mm)}
+        return dataclasses.replace(
+            line, plane_normal=pose.rotate(line.plane_normal), travel=pose.rotate(line.travel), **moved
+        )
+
+    wrong, key = turned_pass(lambda one: FROM_ABOVE, elsewhere)
+    assert wrong.status is PassStatus.DONE and wrong.reached_end and not wrong.teaches
+    assert wrong.outcome.agreement.expected > 1000
+    assert str(wrong.planned.turn) in wrong.doubt and "withdraw" in wrong.doubt
+    assert told(book, session, "pass_outcome") == 1
+    (event,) = (one for one in book.record.events(session.row.session_id) if one.kind == "pass_outcome")
+    assert event.details["outcome"]["doubt"] == wrong.doubt
+    kept = Outcome.from_dict(event.details["outcome"])
+    assert (kept.agreement, kept.doubt) == (wrong.outcome.agreement, wrong.doubt)
+    session.withdraw_pass(key)
+    right, _ = turned_pass(lambda one: one.motion, lambda pose, line: line)
+    assert right.doubt is None and right.outcome.agreement.share > 0.95
+    assert right.outcome.agreement.expected > 1000 and right.teaches
 
 
 def test_one_pass_is_carried_out_at_a_time(book, scanned):
@@ -191,7 +306,7 @@ def test_a_pass_that_was_stopped_or_failed_teaches_nothing(book, scanned, tmp_pa
         assert not any(order.teaches for order in reopened.orders())
         reopened.describe_rig(RigSetup(free_reach(), OPTICS))
         for now in (again, reopened.plan()):
-            assert now.passes[0].chances == FIRST_CHANCES and now.passes[0].trust == 1.0
+            assert now.passes[0].chances == FIRST_CHANCES
             assert not any("passes that should have seen it" in lost.why for lost in now.unreachable)
             if not lines_share:  # nothing was seen: all is wanted as before, and no way is known
                 assert now.promised_mm2 == pytest.approx(plan.promised_mm2)
@@ -291,21 +406,6 @@ def test_a_rig_that_a_client_drives_is_looped(book, scanned):
     assert loop.why_ended == "the limit of 2 passes is met"
     assert [order.status for order in desk.orders()] == [PassStatus.DONE] * 2
     assert desk.orders()[0].outcome.reached_mm2 > 0.7 * desk.orders()[0].outcome.promised_mm2
-
-
-def test_a_session_between_two_passes_of_its_loop_is_not_closed_to_make_room(book, monkeypatch):
-    monkeypatch.setattr("scanner_service.sessions.book.MAX_LIVE", 2)
-    looping, idle = (book.create(name, PushSpec(), SessionSettings(max_points=1000)) for name in ("looping", "idle"))
-    for session in (looping, idle):
-        session.stop()
-    desk = book.pass_desk(looping)
-    desk.loop = LoopState(LoopLimits())
-    third = book.create("third", PushSpec(), SessionSettings(max_points=1000))
-    assert book.open_sessions() == [looping, third]
-    third.stop()
-    desk.loop.running = False
-    fourth = book.create("fourth", PushSpec(), SessionSettings(max_points=1000))
-    assert book.open_sessions() == [third, fourth]
 
 
 def test_a_hand_cannot_be_looped(book, scanned):

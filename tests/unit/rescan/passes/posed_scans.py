@@ -19,6 +19,7 @@ from simulators.posed_rig import PosedScanner
 DENSITY = 20.0
 SCANNER = demo_scanner()
 OPTICS = ScannerOptics(SCANNER.geometry(), SCANNER.field_of_view_mm, SCANNER.points_per_line)
+ASKED = Requirement(density_per_mm2=DENSITY)
 FROM_ABOVE = StraightMotion(Pose.identity(), np.array([0.0, 1.0, 0.0]))
 
 
@@ -35,9 +36,9 @@ class Bench:
         self.map.close_all_passes()
         return self
 
-    def judged(self):
+    def judged(self, requirement=ASKED):
         snapshot = self.map.snapshot()
-        return snapshot, find_regions(snapshot, Requirement(density_per_mm2=DENSITY), SCANNER.geometry())
+        return snapshot, find_regions(snapshot, requirement, SCANNER.geometry())
 
 
 def free_reach(max_tilt_deg=70.0, box_mm=400.0):

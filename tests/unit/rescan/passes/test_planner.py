@@ -30,7 +30,7 @@ WISHES = Wishes(DENSITY, max_passes=3)
 def carried_out(bench, one):
     before = bench.judged()
     bench.scan(one.motion, one.start_mm, one.end_mm, one.line_spacing_mm)
-    return reckon(one, *before, *bench.judged())
+    return reckon(one, *before, *bench.judged(), OPTICS)
 
 
 def test_a_plate_scanned_too_coarsely_is_mended_by_one_finer_pass_of_its_own_axis():

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.rescan_bunny import compare
 from benchmarks.scannable import Allowed, CoverageTruth, sample_surface, scannable
-from scanner_service.rescan.passes.experience import chances_of, trust_of
+from scanner_service.rescan.passes.experience import chances_of
 from scanner_service.rescan.passes.needs import FIRST_CHANCES, Evidence
 from scanner_service.rescan.passes.outcome import KindOutcome, Outcome, RegionOutcome
 from simulators.posed_rig import PosedScanner
@@ -49,30 +49,21 @@ def test_coverage_counts_what_was_scanned_densely_enough():
     assert truth.share == pytest.approx(0.5, abs=0.05)
 
 
-def became(asked_mm2, kept_mm2, reached_mm2, kind=Evidence.FRONTIER):
+def became(asked_mm2, reached_mm2, kind=Evidence.FRONTIER):
     regions = (RegionOutcome(0, asked_mm2, reached_mm2),)
-    return Outcome(regions, np.zeros((0, 3)), (KindOutcome(kind, asked_mm2, kept_mm2),), kept_mm2)
-
-
-def test_promises_learn_from_what_was_reached_within_bounds():
-    assert trust_of([]) == 1.0
-    assert trust_of([became(100.0, 100.0, 120.0)]) == pytest.approx(1.2)
-    assert trust_of([became(100.0, 50.0, 55.0)]) == pytest.approx(1.1)  # what was not there is no matter of trust
-    assert trust_of([became(100.0, 100.0, 0.0)] * 5) == 0.6
-    assert trust_of([became(100.0, 100.0, reached) for reached in (110.0, 110.0, 0.0)]) == pytest.approx(1.1)
-    assert trust_of([became(5.0, 5.0, 0.0)]) == 1.0  # too small to learn from
+    return Outcome(regions, np.zeros((0, 3)), (KindOutcome(kind, asked_mm2, reached_mm2),))
 
 
 def test_each_kind_of_evidence_is_believed_as_far_as_it_proved_true():
     assert chances_of([]) == FIRST_CHANCES
-    learned = chances_of([became(400.0, 40.0, 40.0)])
+    learned = chances_of([became(400.0, 40.0)])
     assert learned[Evidence.FRONTIER] < 0.25
     assert learned[Evidence.MEASURED] == FIRST_CHANCES[Evidence.MEASURED]
-    assert chances_of([became(400.0, 0.0, 0.0), became(400.0, 400.0, 400.0)])[Evidence.FRONTIER] > 0.55
-    beyond = became(400.0, 0.0, 0.0, Evidence.BEYOND)
-    later = [became(100.0, 100.0, 100.0)] * 5  # passes that had no such places teach nothing of them
+    assert chances_of([became(400.0, 0.0), became(400.0, 400.0)])[Evidence.FRONTIER] > 0.55
+    beyond = became(400.0, 0.0, Evidence.BEYOND)
+    later = [became(100.0, 100.0)] * 5  # passes that had no such places teach nothing of them
     assert chances_of([beyond, *later])[Evidence.BEYOND] == chances_of([beyond])[Evidence.BEYOND] < 0.2
-    assert chances_of([became(1e6, 0.0, 0.0)])[Evidence.FRONTIER] == 0.05  # nothing is ruled out for good
+    assert chances_of([became(1e6, 0.0)])[Evidence.FRONTIER] == 0.05  # nothing is ruled out for good
 
 
 @pytest.mark.skipif(not BUNNY.is_dir(), reason="the real scans lie beside the checkout, and are not there")

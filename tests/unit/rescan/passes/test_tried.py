@@ -1,11 +1,14 @@
 """Places that passes missed: tries are passes, however many places of one pass lie together."""
 
 import numpy as np
+import pytest
 
-from scanner_service.rescan.passes.tried import TRIES, Tried
+from scanner_service.rescan.passes.needs import Evidence, Needs
+from scanner_service.rescan.passes.tried import LOWERED, TRIES, Tried
 
 CELL_MM = 0.35
 PLACE = np.zeros((1, 3))
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def cluster(seed):
@@ -13,17 +16,36 @@ def cluster(seed):
     return np.random.default_rng(seed).uniform(-0.1, 0.1, (40, 3))
 
 
+def wanted(places_mm, evidence=Evidence.MEASURED):
+    n = len(places_mm)
+    needs = Needs.plain(np.array(places_mm, dtype=np.float64).reshape(-1, 3), np.tile(UP, (n, 1)), np.ones(n))
+    return needs.changed(evidence=np.full(n, evidence, dtype=np.int64))
+
+
 def test_one_pass_in_vain_is_one_try_however_dense_its_places():
     tried = Tried.nothing()
-    assert tried.times(PLACE, 0.8 * CELL_MM).tolist() == [0]
-    for passes in range(1, TRIES + 2):
+    for passes in range(TRIES):
+        needs, given_up = tried.of(wanted(PLACE), CELL_MM)
+        assert needs.gain_mm2 == pytest.approx([LOWERED**passes]) and not len(given_up)
         tried = tried.and_also(cluster(passes))
-        assert tried.times(PLACE, 0.8 * CELL_MM).tolist() == [passes]
+    needs, given_up = tried.of(wanted(PLACE), CELL_MM)
+    assert not len(needs) and given_up.places_mm.tolist() == PLACE.tolist()
 
 
 def test_only_passes_that_missed_something_near_are_tries():
     far = np.array([[5.0, 0.0, 0.0]])
     tried = Tried.nothing().and_also(cluster(1)).and_also(far).and_also(np.zeros((0, 3))).and_also(cluster(2))
-    asked = np.concatenate([PLACE, far, np.array([[2.0, 2.0, 2.0]])])
-    assert tried.times(asked, 0.8 * CELL_MM).tolist() == [2, 1, 0]
-    assert tried.times(np.zeros((0, 3)), 0.8 * CELL_MM).shape == (0,)
+    needs, _ = tried.of(wanted([*PLACE, *far, [2.0, 2.0, 2.0]]), CELL_MM)
+    assert needs.gain_mm2 == pytest.approx([LOWERED**2, LOWERED, 1.0])
+    nothing, _ = tried.of(wanted([]), CELL_MM)
+    assert not len(nothing)
+
+
+def test_hidden_space_around_where_nothing_was_found_is_believed_in_less_and_surface_is_not():
+    beside = [[0.0, 0.0, 1.5], [0.0, 0.0, 3.0]]
+    tried = Tried.nothing().and_also(PLACE, PLACE).and_also(PLACE, PLACE)
+    for kind in (Evidence.FRONTIER, Evidence.BEYOND):
+        needs, given_up = tried.of(wanted(beside, kind), CELL_MM)
+        assert needs.gain_mm2 == pytest.approx([LOWERED**2, 1.0]) and not len(given_up)
+    for kind in (Evidence.MEASURED, Evidence.FLOOR, Evidence.REFERENCE):
+        assert tried.of(wanted(beside, kind), CELL_MM)[0].gain_mm2 == pytest.approx([1.0, 1.0])

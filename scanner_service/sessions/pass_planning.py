@@ -1,0 +1,102 @@
+"""All that a plan of passes is made from, gathered at one moment, and the plan made of it; owns no state or lock."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.scanline import Pose
+from scanner_service.rescan.passes.experience import chances_of
+from scanner_service.rescan.passes.looks import Look, look_of
+from scanner_service.rescan.passes.motion import Motion, StraightMotion
+from scanner_service.rescan.passes.outcome import Outcome
+from scanner_service.rescan.passes.planner import Wishes, plan_passes
+from scanner_service.rescan.passes.recommendation import Plan
+from scanner_service.rescan.passes.serving import Serving, number_of
+from scanner_service.rescan.passes.tried import Tried
+from scanner_service.sessions.errors import PassUnknown
+from scanner_service.sessions.pass_orders import PassOrder
+from scanner_service.sessions.results import Results
+from scanner_service.sessions.rig_setups import RigSetup
+
+Driven = tuple[int, Motion, float, float]
+"""A pass as it was driven: its number in the map, its motion, where it started and ended."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanQuestion:
+    """What is to be planned for: the verdict, the rig, what is to be served, and what earlier passes taught."""
+
+    results: Results
+    setup: RigSetup
+    serving: Serving
+    earlier: tuple[Outcome, ...]
+    tried: Tried
+    standing: Pose | None
+    driven: tuple[Driven, ...]
+
+    def answered(self) -> Plan:
+        """The plan. It takes about a second for a large map.
+
+        Raises
+        ------
+        PassUnknown : a region that is to be served is not open.
+        PlanningError : the rig or the optics are not known.
+        """
+        results, setup = self.results, self.setup
+        open_ids = {number_of(region) for region in results.regions}
+        unknown = sorted(self.serving.regions - open_ids)
+        if unknown:
+            raise PassUnknown(f"no region {unknown[0]} is open in this session; list the regions again")
+        required = results.requirement.density_per_mm2
+        if required is None:
+            required = float(np.nanmedian(results.report.judgement.required_per_mm2)) if len(results.snapshot) else 1.0
+        wishes = Wishes(
+            required,
+            chances=chances_of(self.earlier),
+            requirement=results.requirement,
+            serving=self.serving,
+        )
+        return plan_passes(
+            results.snapshot,
+            results.report,
+            setup.reach,
+            setup.optics,
+            wishes,
+            self.standing,
+            self.tried,
+            self._looks(),
+            results.regions,
+            results.reference,
+        )
+
+    def _looks(self) -> tuple[Look, ...]:
+        """The passes whose poses are known: those that were ordered, and the session's own."""
+        snapshot, driven, own = self.results.snapshot, list(self.driven), self.setup.scanned_by
+        if isinstance(own, StraightMotion):
+            ordered = {number for number, *_ in driven}
+            for number in sorted(set(snapshot.lines.pass_number.tolist()) - ordered):
+                at = snapshot.lines.position_mm[snapshot.lines.pass_number == number]
+                if len(at) and np.isfinite(at).all():
+                    driven.append((number, own, float(at[0]), float(at[-1])))
+        found = [
+            look_of(snapshot, number, motion, start_mm, end_mm, self.setup.optics.rays)
+            for number, motion, start_mm, end_mm in driven
+            if isinstance(motion, StraightMotion)
+        ]
+        return tuple(look for look in found if look is not None)
+
+
+def outcomes_of(orders: Sequence[PassOrder]) -> tuple[Outcome, ...]:
+    """What became of the passes that were carried out to their end, the oldest first."""
+    return tuple(order.outcome for order in orders if order.teaches and order.outcome is not None)
+
+
+def driven_by(orders: Sequence[PassOrder]) -> tuple[Driven, ...]:
+    """The passes of the map that were ordered, as they were driven; those that lie elsewhere are left out."""
+    return tuple(
+        (number, order.planned.motion, order.planned.start_mm, order.planned.end_mm)
+        for order in orders
+        if order.doubt is None
+        for number in order.map_passes
+    )
