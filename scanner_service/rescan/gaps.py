@@ -18,7 +18,7 @@ of the fan in the scanlines of a pass. Between the two ends A and B of such a pa
 """
 
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 
 import numpy as np
 import numpy.typing as npt
@@ -26,10 +26,9 @@ from scipy.spatial import cKDTree
 
 from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
 from scanner_service.analysis.snapshot import MapSnapshot, RadiusRule, UInt8Array
+from scanner_service.rescan.frames import Frames, angle_and_depth
 from scanner_service.rescan.stations import IntArray, Stations
 from scanner_service.rescan.strips import Strips, in_a_row
-
-Pairs = tuple[IntArray, IntArray, Float64Array, IntArray]  # first and second rows, width_mm, lane
 
 _LEAST_SPACINGS = 3.0
 _FAR_BELOW = 6.0  # radii: ends further apart are on one flank only if the planes of both say so
@@ -46,6 +45,15 @@ class GapKind(IntEnum):
     OUT_OF_RANGE = 3
     HOLE = 4
     FILLED = 5  # a shadow of this pass whose middle another pass has seen
+
+
+class Mark(IntFlag):
+    """What gaps say of the points at their ends."""
+
+    SHADOW_HIGH = 1
+    SHADOW_LOW = 2
+    FLANK = 4
+    OUT_OF_RANGE = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +85,20 @@ class Gaps:
         return np.flatnonzero(self.kind == kind)
 
 
+def marks_of(count: int, gaps: Gaps) -> UInt8Array:
+    """(count,) the marks of all points, as the bits of `Mark`."""
+    marks = np.zeros(count, dtype=np.uint8)
+    for kind, above, below in (
+        (GapKind.SHADOW, Mark.SHADOW_HIGH, Mark.SHADOW_LOW),
+        (GapKind.FLANK, Mark.FLANK, Mark.FLANK),
+        (GapKind.OUT_OF_RANGE, Mark.OUT_OF_RANGE, Mark.OUT_OF_RANGE),
+    ):
+        rows = gaps.of_kind(kind)
+        marks[gaps.high[rows]] |= np.uint8(above)
+        marks[gaps.low[rows]] |= np.uint8(below)
+    return marks
+
+
 def gap_lengths_mm(snapshot: MapSnapshot, gaps: Gaps, rows: npt.NDArray[np.intp]) -> Float64Array:
     """(k,) distance between the ends of some gaps."""
     vector = snapshot.points_mm[gaps.high[rows]] - snapshot.points_mm[gaps.low[rows]]
@@ -87,105 +109,117 @@ def gap_lengths_mm(snapshot: MapSnapshot, gaps: Gaps, rows: npt.NDArray[np.intp]
 class Fan:
     """Each point in the coordinates of its pass's laser fan: `angle_rad` (n,) across, `depth_mm` (n,) from the laser.
 
-    Depth runs against the sensor's z, `axis` (p, 3) by pass.
+    Depth runs against the sensor's z.
     """
 
     angle_rad: Float64Array
     depth_mm: Float64Array
-    axis: Float64Array
 
 
-def fan_of(
-    snapshot: MapSnapshot, stations: Stations, strips: Strips, towards_sensor: Float64Array | None = None
-) -> Fan:
-    """Angle and depth of every point.
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Neighbours between which a gap may lie, one row each: along the scanlines, or under one ray across them.
 
-    `towards_sensor` (3,) is the unit direction of the sensor's z in the part frame; without it the ray halfway between
-    the outermost rays of a pass that returned stands for it, which is askew where the part fills one side of the fan.
+    `first` and `second` (q,) are rows of the snapshot, and a pair whose first is the second of the pair before it goes
+    on from there. `kind` (q,) is the GapKind, 0 where the two are no gap; `is_down` (q,) whether the second is the
+    lower end.
     """
+
+    first: IntArray
+    second: IntArray
+    kind: UInt8Array
+    is_down: BoolArray
+
+
+def fan_of(snapshot: MapSnapshot, stations: Stations, frames: Frames) -> Fan:
+    """Angle and depth of every point."""
     group = stations.group[snapshot.line]
     ray = snapshot.points_mm - snapshot.lines.laser_mm[snapshot.line]
-    axis = np.tile([0.0, 0.0, -1.0], (len(strips.along), 1))
-    for number in np.unique(group):
-        mine = ray[group == number]
-        along = strips.along[number]
-        mean = mine.mean(axis=0)
-        mean = mean - along * (mean @ along)
-        if np.linalg.norm(mean) > 0:
-            mean /= np.linalg.norm(mean)
-            angle = np.arctan2(mine @ along, mine @ mean)
-            middle = 0.5 * (angle.min() + angle.max())
-            axis[number] = np.cos(middle) * mean + np.sin(middle) * along
-    if towards_sensor is not None:
-        axis[:] = -towards_sensor
-    e = strips.along[group] if len(group) else np.zeros((0, 3))
-    c = axis[group] if len(group) else np.zeros((0, 3))
-    e = e - c * np.einsum("ij,ij->i", e, c)[:, None]
-    e /= np.maximum(np.linalg.norm(e, axis=1, keepdims=True), 1e-12)  # a line along the ray has no angle but 0
-    depth = np.einsum("ij,ij->i", ray, c)
-    return Fan(np.arctan2(np.einsum("ij,ij->i", ray, e), depth), depth, axis)
+    return Fan(*angle_and_depth(ray, frames.along[group], frames.axis[group]))
 
 
-def find_gaps(
-    snapshot: MapSnapshot, stations: Stations, strips: Strips, fan: Fan, geometry: SensorGeometry | None = None
+def column_of(fan: Fan, frames: Frames, rows: IntArray, group: IntArray) -> IntArray:
+    """(k,) place in the fan of points of passes `group` (k,), two rays a column; all in one where none is known.
+
+    A whole line then leaves no column empty, however its rays fall.
+    """
+    step = 2.0 * frames.pitch_rad[group]
+    return np.floor(fan.angle_rad[rows] / np.where(step > 0, step, np.inf)).astype(np.int64)
+
+
+def find_pairs(
+    snapshot: MapSnapshot,
+    stations: Stations,
+    frames: Frames,
+    strips: Strips,
+    fan: Fan,
+    geometry: SensorGeometry | None = None,
+) -> tuple[Pairs, Pairs]:
+    """All pairs of neighbours along the lines, and across them, with the kind of those that are gaps.
+
+    None is FILLED: that is for `seen_by_others` to say of the shadows.
+    """
+    ends = (_pairs_along(snapshot, strips), _pairs_across(snapshot, stations, frames, strips, fan))
+    in_the_air = _in_the_air(snapshot, strips)
+    found = []
+    for (first, second), across in zip(ends, (False, True), strict=True):
+        kind, is_down = _classified(snapshot, stations, strips, fan, geometry, first, second, across)
+        kind[(kind > 0) & in_the_air[np.where(is_down, first, second)]] = GapKind.HOLE
+        found.append(Pairs(first, second, kind, is_down))
+    return found[0], found[1]
+
+
+def gaps_between(
+    snapshot: MapSnapshot,
+    stations: Stations,
+    frames: Frames,
+    fan: Fan,
+    first: tuple[IntArray, IntArray],
+    second: tuple[IntArray, IntArray],
+    kind: tuple[UInt8Array, UInt8Array],
+    is_down: tuple[BoolArray, BoolArray],
 ) -> Gaps:
-    """All gaps between settled points, classified."""
-    pairs = [_pairs_along(snapshot, stations, strips), _pairs_across(snapshot, stations, strips, fan)]
-    parts = [
-        _classified(snapshot, stations, strips, fan, geometry, first, second, width, lane, across)
-        for (first, second, width, lane), across in zip(pairs, (False, True), strict=True)
-    ]
-    high = np.concatenate([part.high for part in parts])
-    kind = np.concatenate([part.kind for part in parts])
-    kind[_in_the_air(snapshot, strips)[high]] = GapKind.HOLE
+    """Gaps of pairs that are some, those along the lines and those across them, each by its ends and kind."""
+    along, across = (snapshot.line[rows] for rows in first)
+    group = stations.group[across]
+    away = np.linalg.norm(snapshot.points_mm[first[1]] - snapshot.lines.laser_mm[across], axis=1)
+    width = (np.nanmin(stations.stride_mm[along], axis=1, initial=np.inf), 2.0 * frames.pitch_rad[group] * away)
+    lane = (stations.rank[along], column_of(fan, frames, first[1], group))
+    one, other, down = (np.concatenate(parts) for parts in (first, second, is_down))
     return Gaps(
-        high=high,
-        low=np.concatenate([part.low for part in parts]),
-        across=np.concatenate([part.across for part in parts]),
-        width_mm=np.concatenate([part.width_mm for part in parts]),
-        kind=kind,
-        lane=np.concatenate([part.lane for part in parts]),
+        high=np.where(down, one, other),
+        low=np.where(down, other, one),
+        across=np.repeat([False, True], [len(along), len(across)]),
+        width_mm=np.concatenate(width),
+        kind=np.concatenate(kind),
+        lane=np.concatenate(lane),
     )
 
 
-def _pairs_along(snapshot: MapSnapshot, stations: Stations, strips: Strips) -> Pairs:
+def _pairs_along(snapshot: MapSnapshot, strips: Strips) -> tuple[IntArray, IntArray]:
     """Consecutive returns of each scanline."""
     order = strips.order[snapshot.neighbours[strips.order] > 0]
     first, second = order[:-1], order[1:]
     same = snapshot.line[first] == snapshot.line[second]
-    first, second = first[same], second[same]
-    line = snapshot.line[first]
-    return first, second, np.nanmin(stations.stride_mm[line], axis=1, initial=np.inf), stations.rank[line]
+    return first[same], second[same]
 
 
-def _pairs_across(snapshot: MapSnapshot, stations: Stations, strips: Strips, fan: Fan) -> Pairs:
+def _pairs_across(
+    snapshot: MapSnapshot, stations: Stations, frames: Frames, strips: Strips, fan: Fan
+) -> tuple[IntArray, IntArray]:
     """Consecutive returns under the same ray, along the travel of each pass."""
     order = strips.order[snapshot.neighbours[strips.order] > 0]
-    if len(order) < 2:
-        return order[:0], order[:0], np.zeros(0), order[:0]
-    line = snapshot.line[order]
-    group = stations.group[line]
-    step = np.abs(np.diff(fan.angle_rad[order]))
-    within = (np.diff(line) == 0) & (np.diff(snapshot.index[order]) == 1)
-    pitch = np.full(len(strips.along), np.nan)
-    for number in np.unique(group):
-        mine = step[within & (group[1:] == number)]
-        if len(mine):
-            pitch[number] = np.median(mine)
-    usable = np.isfinite(pitch[group]) & (pitch[group] > 0)
-    order, line, group = order[usable], line[usable], group[usable]
-    # two rays a column: a whole line then leaves no column empty, however its rays fall
-    column = np.floor(fan.angle_rad[order] / (2.0 * pitch[group])).astype(np.int64)
-    rank = stations.rank[line]
+    group = stations.group[snapshot.line[order]]
+    usable = frames.pitch_rad[group] > 0
+    order, group = order[usable], group[usable]
+    column, rank = column_of(fan, frames, order, group), stations.rank[snapshot.line[order]]
     by_column = np.lexsort((rank, column, group))
     order, column, group, rank = order[by_column], column[by_column], group[by_column], rank[by_column]
     fresh = np.ones(len(order), dtype=bool)
     fresh[1:] = (np.diff(rank) != 0) | (np.diff(column) != 0) | (np.diff(group) != 0)
     order, column, group = order[fresh], column[fresh], group[fresh]
     same = (np.diff(column) == 0) & (np.diff(group) == 0)
-    first, second = order[:-1][same], order[1:][same]
-    distance = np.linalg.norm(snapshot.points_mm - snapshot.lines.laser_mm[snapshot.line], axis=1)
-    return first, second, 2.0 * pitch[group[:-1][same]] * distance[first], column[:-1][same]
+    return order[:-1][same], order[1:][same]
 
 
 def _classified(
@@ -196,11 +230,9 @@ def _classified(
     geometry: SensorGeometry | None,
     first: IntArray,
     second: IntArray,
-    width: Float64Array,
-    lane: IntArray,
     across: bool,
-) -> Gaps:
-    """The pairs that are gaps; `first` and `second` follow each other, so a jump that goes on can be told."""
+) -> tuple[UInt8Array, BoolArray]:
+    """Kind of each pair (0: no gap), and whether the second is the lower end; pairs follow each other as in `Pairs`."""
     line = snapshot.line
     vector = snapshot.points_mm[second] - snapshot.points_mm[first]
     length = np.linalg.norm(vector, axis=1)
@@ -253,19 +285,8 @@ def _classified(
     foot &= np.where(drop >= 0, off_second, off_first) > on_tangent_mm
     kind[(jump & goes_on & ~foot) | (steep & ~leaves_surface & ~silhouette)] = GapKind.FLANK
     settled = snapshot.settled[first] & snapshot.settled[second]
-    rows = np.flatnonzero((steep | apart) & settled)
-    kind[rows] = np.where(
-        _seen_by_others(snapshot, stations, first[rows], second[rows], kind[rows]), GapKind.FILLED, kind[rows]
-    )
-    down = drop[rows] >= 0
-    return Gaps(
-        high=np.where(down, first[rows], second[rows]),
-        low=np.where(down, second[rows], first[rows]),
-        across=np.full(len(rows), across),
-        width_mm=width[rows],
-        kind=kind[rows],
-        lane=lane[rows],
-    )
+    kind[~((steep | apart) & settled)] = 0
+    return kind, drop >= 0
 
 
 def _in_the_air(snapshot: MapSnapshot, strips: Strips) -> BoolArray:
@@ -300,20 +321,23 @@ def _far_walls(first: IntArray, second: IntArray, steep: BoolArray, drop: Float6
     return far
 
 
-def _seen_by_others(
-    snapshot: MapSnapshot, stations: Stations, first: IntArray, second: IntArray, kind: UInt8Array
+def seen_by_others(
+    snapshot: MapSnapshot, stations: Stations, first: IntArray, second: IntArray, others: IntArray
 ) -> BoolArray:
-    """True for shadows with a point of another pass nearer to their middle than their own ends are."""
+    """True for pairs with a point of another pass nearer to their middle than their own ends are.
+
+    `others` are the points that may be; those further than nine tenths of half a pair from its middle are not looked
+    for.
+    """
     seen = np.zeros(len(first), dtype=bool)
-    group = stations.group[snapshot.line]
-    counted = snapshot.neighbours > 0
-    for number in np.unique(group) if len(np.unique(group)) > 1 else ():
-        mine = np.flatnonzero((kind == GapKind.SHADOW) & (group[first] == number))
-        others = snapshot.points_mm[counted & (group != number)]
-        if len(mine) and len(others):
+    others = others[snapshot.neighbours[others] > 0]
+    of_pair, of_other = stations.group[snapshot.line[first]], stations.group[snapshot.line[others]]
+    for number in np.unique(of_pair):
+        mine, points = np.flatnonzero(of_pair == number), snapshot.points_mm[others[of_other != number]]
+        if len(points):
             start, end = snapshot.points_mm[first[mine]], snapshot.points_mm[second[mine]]
             half = 0.5 * np.linalg.norm(end - start, axis=1)
-            seen[mine] = cKDTree(others).query(0.5 * (start + end))[0] < 0.9 * half
+            seen[mine] = cKDTree(points).query(0.5 * (start + end))[0] < 0.9 * half
     return seen
 
 

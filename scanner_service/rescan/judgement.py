@@ -13,10 +13,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
-from scanner_service.analysis.snapshot import MapSnapshot, UInt8Array
+from scanner_service.analysis.snapshot import LineTable, MapSnapshot, UInt8Array
 from scanner_service.rescan.border import LEAST_OFFSET, border_aware
 from scanner_service.rescan.curvature import curvature_across_per_mm
-from scanner_service.rescan.gaps import Fan, GapKind, Gaps, near_range_end
+from scanner_service.rescan.frames import Frames
+from scanner_service.rescan.gaps import Fan, Mark, near_range_end
 from scanner_service.rescan.noise import noise_along_lines
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.stations import IntArray, Stations
@@ -100,37 +101,35 @@ def judge(
     snapshot: MapSnapshot,
     requirement: Requirement,
     stations: Stations,
+    frames: Frames,
     strips: Strips,
     fan: Fan,
-    gaps: Gaps,
+    marks: UInt8Array,
     geometry: SensorGeometry | None = None,
     noise_mm: float | None = None,
+    at_most_per_mm2: float = np.inf,
 ) -> Judgement:
     """Judge every settled point.
 
     Parameters
     ----------
-    snapshot, stations, strips, fan, gaps : the map and what was measured on it.
+    snapshot, stations, frames, strips, fan : the map and what was measured on it.
+    marks : (n,) what the gaps say of each point, as `marks_of` has it.
+    at_most_per_mm2 : by default no more than this is required, as `asked_of_the_first_pass` has it.
     geometry : the scanner's optics; without it no point is `out_of_range`.
     noise_mm : one standard deviation of the sensor along its ray; None: no point is `noisy`.
     """
     line, n = snapshot.line, len(snapshot)
     required = requirement.per_mm2(strips.line_spacing_mm, strips.nominal_point_spacing_mm)
     if requirement.density_per_mm2 is None:
-        required = _no_more_than_the_first_pass(required, strips)
+        required = np.minimum(required, at_most_per_mm2)
     counted_density = border_aware(snapshot.side_density_per_mm2, snapshot.offset)
     counted_density = np.where(snapshot.isolated, snapshot.side_density_per_mm2, counted_density)  # no disc to speak of
     judged = snapshot.settled & (snapshot.neighbours > 0) & np.isfinite(required)
     if requirement.interest is not None:
         judged &= requirement.interest.holds(snapshot.points_mm)
 
-    wall = np.zeros(n, dtype=bool)
-    flank = np.zeros(n, dtype=bool)
-    for kind, marks in ((GapKind.SHADOW, wall), (GapKind.FLANK, flank)):
-        rows = gaps.of_kind(kind)
-        marks[gaps.high[rows]] = True
-        marks[gaps.low[rows]] = True
-
+    wall, flank = (marks & (Mark.SHADOW_HIGH | Mark.SHADOW_LOW)) > 0, (marks & Mark.FLANK) > 0
     width = _width_on_surface(snapshot, stations, strips, wall & ~flank)
     allowed = 1.0 / (required * strips.nominal_point_spacing_mm)
     stride, gap, missing = stations.stride_mm[line], stations.gap_mm[line], stations.missing[line]
@@ -146,7 +145,9 @@ def judge(
     enough = (snapshot.side_density_per_mm2 >= required) & ~one_sided
     failing = ((too_wide & ~enough[:, None]) | beyond | beyond_rule) & judged[:, None]
     allowed = np.fmin(allowed, by_rule)
-    filled = _filled(snapshot, strips, failing, np.fmin(allowed, strips.reach_mm))
+    filled = np.zeros_like(failing)
+    if len(frames) > 1:
+        filled = _filled(snapshot, strips, failing, np.fmin(allowed, strips.reach_mm))
     failing &= ~filled
     width = np.where(filled, np.fmin(width, delta), width)  # what lies further out is the other pass's surface
 
@@ -185,29 +186,27 @@ def judge(
         edge = ~np.isfinite(strips.width_mm).all(axis=1) | _line_ends(snapshot, strips)
         near = near_range_end(snapshot, stations, strips, fan, geometry)
         reason[judged & edge & near] = Reason.OUT_OF_RANGE
-    rows = gaps.of_kind(GapKind.OUT_OF_RANGE)
-    reason[np.concatenate([gaps.high[rows], gaps.low[rows]])] = Reason.OUT_OF_RANGE
-    rows = gaps.of_kind(GapKind.SHADOW)
-    ends = np.concatenate([gaps.high[rows], gaps.low[rows]])
-    reason[ends[np.isin(reason[ends], (Reason.NONE, Reason.ISOLATED))]] = Reason.SHADOW
+    reason[(marks & Mark.OUT_OF_RANGE) > 0] = Reason.OUT_OF_RANGE
+    reason[wall & ((reason == Reason.NONE) | (reason == Reason.ISOLATED))] = Reason.SHADOW
     # the few returns that a wall gives on its way down are part of it; a rib's top, never a lower end, is not
-    below = gaps.low[rows]
-    reason[below[(reason[below] == Reason.SPARSE) & ~failing[below].any(axis=1)]] = Reason.SHADOW
+    below = ((marks & Mark.SHADOW_LOW) > 0) & (reason == Reason.SPARSE)
+    reason[below & ~failing.any(axis=1)] = Reason.SHADOW
     reason[~judged] = Reason.NONE
     return Judgement(judged, reason, required, counted_density, worst, width, failing, grazing, noise, allowed)
 
 
-def _no_more_than_the_first_pass(required_per_mm2: Float64Array, strips: Strips) -> Float64Array:
-    """(n,) What is asked of later passes is bounded by what the first was asked: a finer pass must be able to mend."""
-    if not len(required_per_mm2):
-        return required_per_mm2
-    first = required_per_mm2[strips.group == strips.group[0]]
-    known = first[np.isfinite(first)]
-    return (
-        np.minimum(required_per_mm2, float(np.median(known)))
-        if len(known) and (first.size < strips.group.size)
-        else (required_per_mm2)
-    )
+def asked_of_the_first_pass(lines: LineTable, stations: Stations, frames: Frames, requirement: Requirement) -> float:
+    """What the first pass was asked by default, per mm²; inf where there is no other.
+
+    It bounds what is asked of later passes: a finer pass must be able to mend.
+    """
+    if len(frames) < 2:
+        return float("inf")
+    number = int(stations.group[0])
+    first = np.flatnonzero(stations.group == number)[: frames.lines[number]]
+    asked = requirement.per_mm2(lines.line_spacing_mm[first], stations.point_spacing_mm[first])
+    known = asked[np.isfinite(asked)]
+    return float(np.median(known)) if len(known) else float("inf")
 
 
 def _allowed_by_rule(
@@ -259,8 +258,7 @@ def _filled(snapshot: MapSnapshot, strips: Strips, failing: BoolArray, allowed_m
     """(n, 2) True where points of other passes lie all along a failing strip, at most half the allowed width away."""
     filled = np.zeros_like(failing)
     rows, side = np.nonzero(failing & (strips.link >= 0))
-    groups = np.unique(snapshot.lines.pass_number[snapshot.lines.stationary == np.False_])
-    if not len(rows) or len(groups) < 2:
+    if not len(rows):
         return filled
     tree = cKDTree(snapshot.points_mm[snapshot.neighbours > 0])
     start, end = snapshot.points_mm[rows], snapshot.points_mm[strips.link[rows, side]]

@@ -1,15 +1,18 @@
 """Connected patches of points that fail for one reason, each as a region; knows verdicts, takes none."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from drivers.scanline import BoolArray, Float64Array
-from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.analysis.snapshot import Int32Array, MapSnapshot
+from scanner_service.rescan.frames import Frames
 from scanner_service.rescan.gaps import Fan, GapKind, Gaps
 from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason
-from scanner_service.rescan.outline import patch_of
+from scanner_service.rescan.outline import Outlines
 from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of, succession
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.stations import IntArray, Stations
@@ -22,34 +25,49 @@ _LONGEST = 6.0  # radii that an outline reaches at most to join the two ends of 
 _GAP_SHARE = 0.75  # a triangle with a gap for a side has about this circumradius in gap lengths
 
 
+@dataclass(frozen=True, slots=True)
+class Unfolded:
+    """Points by their ray and their scanline, each pass on its own scale: no surface folds there."""
+
+    line: Int32Array
+    stations: Stations
+    frames: Frames
+    fan: Fan
+    line_spacing_mm: Float64Array
+
+    def mm(self, rows: IntArray) -> Float64Array:
+        """(k, 2) where some points are."""
+        line = self.line[rows]
+        ray = self.fan.angle_rad[rows] * self.frames.distance_mm[self.stations.group[line]]
+        return np.column_stack([ray, self.stations.rank[line] * self.line_spacing_mm[rows]])
+
+
 def patches(
     snapshot: MapSnapshot,
     requirement: Requirement,
     strips: Strips,
     gaps: Gaps,
     judgement: Judgement,
-    unfolded_mm: Float64Array,
+    unfolded: Unfolded,
+    outlines: Outlines,
     reason: Reason,
     noise_mm: float | None,
 ) -> tuple[list[RescanRegion], list[IntArray]]:
-    """The patches of one reason as regions without a number, and the rows of those too few for a region.
-
-    `unfolded_mm` (n, 2) are ray and line of every point, as `as_scanned` has them.
-    """
+    """The patches of one reason as regions without a number, and the rows of those too few for a region."""
     rows = np.flatnonzero(judgement.reason == reason).astype(np.int64)
     if not len(rows):
         return [], []
-    wide = np.where(judgement.failing_strip & np.isfinite(strips.width_mm), strips.width_mm, 0.0).max(axis=1)
-    steep = reason is Reason.STEEP
-    near = _BRIDGE * strips.reach_mm if steep else np.maximum(strips.reach_mm, wide)
+    width, steep = strips.width_mm[rows], reason is Reason.STEEP
+    wide = np.where(judgement.failing_strip[rows] & np.isfinite(width), width, 0.0).max(axis=1)
+    near = _BRIDGE * strips.reach_mm[rows] if steep else np.maximum(strips.reach_mm[rows], wide)
     connection = np.maximum(near, wide)
     links, span = _links(snapshot, strips, gaps, reason, rows)
     place = np.full(len(snapshot), -1, dtype=np.int64)
     place[rows] = np.arange(len(rows))
-    edges = [_near_edges(snapshot.points_mm[rows], near[rows]), place[links]]
+    edges = [_near_edges(snapshot.points_mm[rows], near), place[links]]
     for side in (0, 1):
         link = strips.link[rows, side]
-        close = (link >= 0) & (strips.width_mm[rows, side] <= connection[rows])
+        close = (link >= 0) & (width[:, side] <= connection)
         if steep:
             close[close] = overhang_mm(snapshot, rows[close], link[close]) <= UPRIGHT * strips.reach_mm[rows[close]]
         edges.append(np.column_stack([np.flatnonzero(close), place[link[close]]]))
@@ -61,21 +79,25 @@ def patches(
     label = connected_components(graph, directed=False)[1]
     by_label = np.argsort(label, kind="stable")
     groups = np.split(rows[by_label], np.flatnonzero(np.diff(label[by_label])) + 1)
-    np.maximum.at(connection, links[:, 0], span)
-    np.maximum.at(connection, links[:, 1], span)
+    np.maximum.at(connection, place[links[:, 0]], span)
+    np.maximum.at(connection, place[links[:, 1]], span)
     large = [
-        _region(snapshot, requirement, strips, judgement, unfolded_mm, reason, group, connection[group], noise_mm)
+        _region(
+            snapshot,
+            requirement,
+            strips,
+            judgement,
+            unfolded,
+            outlines,
+            reason,
+            group,
+            connection[place[group]],
+            noise_mm,
+        )
         for group in groups
         if len(group) >= requirement.region_points
     ]
     return large, [group for group in groups if len(group) < requirement.region_points]
-
-
-def as_scanned(snapshot: MapSnapshot, stations: Stations, strips: Strips, fan: Fan) -> Float64Array:
-    """(n, 2) every point by its ray and its scanline, each pass on its own scale: no surface folds there."""
-    distance = np.linalg.norm(snapshot.points_mm - snapshot.lines.laser_mm[snapshot.line], axis=1)
-    ray = fan.angle_rad * (float(np.median(distance)) if len(distance) else 0.0)
-    return np.column_stack([ray, stations.rank[snapshot.line] * strips.line_spacing_mm])
 
 
 def _links(
@@ -142,7 +164,8 @@ def _region(
     requirement: Requirement,
     strips: Strips,
     judgement: Judgement,
-    unfolded_mm: Float64Array,
+    unfolded: Unfolded,
+    outlines: Outlines,
     reason: Reason,
     rows: IntArray,
     connection_mm: Float64Array,
@@ -155,10 +178,10 @@ def _region(
     if reason is Reason.OUT_OF_RANGE:  # what is missing lies beyond the points, not around them
         owner, other = rows[:0], rows[:0]
     points = np.concatenate([snapshot.points_mm[rows], 0.5 * (snapshot.points_mm[owner] + snapshot.points_mm[other])])
-    unfolded = np.concatenate([unfolded_mm[rows], 0.5 * (unfolded_mm[owner] + unfolded_mm[other])])
+    flat = np.concatenate([unfolded.mm(rows), 0.5 * (unfolded.mm(owner) + unfolded.mm(other))])
     connection = np.concatenate([connection_mm, connection_mm[np.searchsorted(rows, owner)]])
     spacing = np.fmin(strips.nominal_point_spacing_mm[np.concatenate([rows, owner])], connection)
-    patch = patch_of(points, connection, spacing, unfolded if one_pass else None)
+    patch = outlines.patch_of(points, connection, spacing, flat if one_pass else None)
     normal = mean_normal(snapshot.normals[rows])
     if np.isnan(normal).any():
         towards = snapshot.lines.laser_mm[snapshot.line[rows]].mean(axis=0) - patch.centroid_mm

@@ -6,20 +6,21 @@ import numpy as np
 
 from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
 from scanner_service.analysis.snapshot import MapSnapshot, UInt8Array
-from scanner_service.rescan.gaps import GapKind, Gaps, fan_of, find_gaps, gap_lengths_mm
-from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason, judge
-from scanner_service.rescan.patches import UPRIGHT, as_scanned, patches
+from scanner_service.rescan.gaps import GapKind, Gaps, gap_lengths_mm
+from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason
+from scanner_service.rescan.outline import Outlines
+from scanner_service.rescan.patches import UPRIGHT, Unfolded, patches
+from scanner_service.rescan.points import PointVerdicts
 from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of, succession
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.ribbons import Ribbon, shadow_ribbons
-from scanner_service.rescan.rungs import settled_kinds
-from scanner_service.rescan.stations import IntArray, stations_of
-from scanner_service.rescan.strips import Strips, strips_of
+from scanner_service.rescan.stations import IntArray
+from scanner_service.rescan.strips import Strips
 
 _SHARED = 1.0 / 3.0  # share of a ribbon's upper or lower ends that makes it part of a flank
 _FOOT = 4.0  # radii: how long the foot of a flank may be that has no gaps of its own
 
-__all__ = ["RegionReport", "RescanRegion", "SmallPatches", "find_regions"]
+__all__ = ["RegionFinder", "RegionReport", "RescanRegion", "SmallPatches", "find_regions"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +74,76 @@ class RegionReport:
         }
 
 
+class RegionFinder:
+    """Finds regions of one map again and again while it grows; arguments as `find_regions` has them.
+
+    What it finds is what `find_regions` would find: what is said of points is renewed where the map has changed, and a
+    patch is outlined again only when it is another.
+    """
+
+    def __init__(
+        self,
+        requirement: Requirement | None = None,
+        geometry: SensorGeometry | None = None,
+        noise_mm: float | None = None,
+        towards_sensor: Float64Array | None = None,
+    ) -> None:
+        if noise_mm is None and geometry is not None and geometry.noise_mm > 0:
+            noise_mm = geometry.noise_mm
+        self._requirement = requirement or Requirement()
+        self._noise_mm = noise_mm
+        self._points = PointVerdicts(self._requirement, geometry, noise_mm, towards_sensor)
+        self._outlines = Outlines()
+
+    def find(self, snapshot: MapSnapshot, changed: IntArray | None = None) -> RegionReport:
+        """Find what is worth another pass.
+
+        Parameters
+        ----------
+        snapshot : the live map; only its settled points are judged.
+        changed : (k,) rows of it that are new or other than when regions were found last; None: any may be.
+        """
+        points = self._points.renew(snapshot, changed)
+        self._outlines.new_round()
+        requirement, strips = self._requirement, points.strips
+        ribbons = shadow_ribbons(snapshot, requirement, strips, points.gaps)
+        ribbons, gaps, judgement = _flanks_completed(snapshot, ribbons, strips, points.gaps, points.judgement)
+        drafts = _shadow_regions(ribbons, gaps, judgement)
+        small: list[tuple[Reason, int, float]] = []
+        unfolded = Unfolded(snapshot.line, points.stations, points.frames, points.fan, strips.line_spacing_mm)
+        for reason in Reason:
+            if reason not in (Reason.NONE, Reason.SHADOW):
+                large, few = patches(
+                    snapshot, requirement, strips, gaps, judgement, unfolded, self._outlines, reason, self._noise_mm
+                )
+                drafts += large
+                small += [(reason, len(rows), _nominal_area(strips, rows)) for rows in few]
+        listed = []
+        least = requirement.least_area_mm2(float(np.median(strips.reach_mm)) if len(snapshot) else 0.0)
+        for draft in drafts:
+            if draft.point_count >= requirement.region_points and draft.area_mm2 >= least:
+                listed.append(draft)
+            else:
+                small.append((draft.reason, draft.point_count, draft.area_mm2))
+        listed.sort(key=lambda draft: (-draft.priority, *draft.centroid_mm.tolist()))
+        regions = tuple(replace(draft, number=number) for number, draft in enumerate(listed, start=1))
+        rescan = np.zeros(len(snapshot), dtype=bool)
+        for region in regions:
+            rescan[region.point_rows] = True
+        read_only(rescan)
+        return RegionReport(
+            version=snapshot.version,
+            regions=regions,
+            rescan=rescan,
+            reason=judgement.reason,
+            counts=_counts(snapshot, judgement, requirement),
+            small_patches=_by_reason(small),
+            judgement=judgement,
+            strips=strips,
+            gaps=gaps,
+        )
+
+
 def find_regions(
     snapshot: MapSnapshot,
     requirement: Requirement | None = None,
@@ -80,7 +151,7 @@ def find_regions(
     noise_mm: float | None = None,
     towards_sensor: Float64Array | None = None,
 ) -> RegionReport:
-    """Find what is worth another pass.
+    """Find what is worth another pass, in a map that is looked at once.
 
     Parameters
     ----------
@@ -91,56 +162,7 @@ def find_regions(
         either nothing is called `noisy`.
     towards_sensor : (3,) unit direction of the sensor's z in the part frame; None: taken from the fan's middle ray.
     """
-    requirement = requirement or Requirement()
-    if noise_mm is None and geometry is not None and geometry.noise_mm > 0:
-        noise_mm = geometry.noise_mm
-    stations = stations_of(snapshot.lines)
-    strips = strips_of(snapshot, stations, requirement)
-    fan = fan_of(snapshot, stations, strips, towards_sensor)
-    gaps = settled_kinds(snapshot, strips, find_gaps(snapshot, stations, strips, fan, geometry))
-    if requirement.interest is not None:
-        gaps = _within(requirement.interest.holds(snapshot.points_mm), gaps)
-    judgement = judge(snapshot, requirement, stations, strips, fan, gaps, geometry, noise_mm)
-    ribbons = shadow_ribbons(snapshot, requirement, strips, gaps)
-    ribbons, gaps, judgement = _flanks_completed(snapshot, ribbons, strips, gaps, judgement)
-    drafts = _shadow_regions(ribbons, gaps, judgement)
-    small: list[tuple[Reason, int, float]] = []
-    unfolded = as_scanned(snapshot, stations, strips, fan)
-    for reason in Reason:
-        if reason not in (Reason.NONE, Reason.SHADOW):
-            large, few = patches(snapshot, requirement, strips, gaps, judgement, unfolded, reason, noise_mm)
-            drafts += large
-            small += [(reason, len(rows), _nominal_area(strips, rows)) for rows in few]
-    listed = []
-    least = requirement.least_area_mm2(float(np.median(strips.reach_mm)) if len(snapshot) else 0.0)
-    for draft in drafts:
-        if draft.point_count >= requirement.region_points and draft.area_mm2 >= least:
-            listed.append(draft)
-        else:
-            small.append((draft.reason, draft.point_count, draft.area_mm2))
-    listed.sort(key=lambda draft: (-draft.priority, *draft.centroid_mm.tolist()))
-    regions = tuple(replace(draft, number=number) for number, draft in enumerate(listed, start=1))
-    rescan = np.zeros(len(snapshot), dtype=bool)
-    for region in regions:
-        rescan[region.point_rows] = True
-    read_only(rescan)
-    return RegionReport(
-        version=snapshot.version,
-        regions=regions,
-        rescan=rescan,
-        reason=judgement.reason,
-        counts=_counts(snapshot, judgement, requirement),
-        small_patches=_by_reason(small),
-        judgement=judgement,
-        strips=strips,
-        gaps=gaps,
-    )
-
-
-def _within(inside: BoolArray, gaps: Gaps) -> Gaps:
-    """The gaps with those that have no end inside of the region of interest of no consequence."""
-    beyond = ~(inside[gaps.high] | inside[gaps.low])
-    return replace(gaps, kind=np.where(beyond, np.uint8(GapKind.HOLE), gaps.kind))
+    return RegionFinder(requirement, geometry, noise_mm, towards_sensor).find(snapshot)
 
 
 def _counts(snapshot: MapSnapshot, judgement: Judgement, requirement: Requirement) -> dict[str, int]:

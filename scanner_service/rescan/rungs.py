@@ -81,9 +81,12 @@ def rungs_of(snapshot: MapSnapshot, strips: Strips, gaps: Gaps, rows: IntArray) 
     graph = coo_matrix((np.ones(len(hangs)), (hangs, by_top[at[hangs]])), shape=(len(rows), len(rows)))
     of_gap = np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
     count = int(of_gap.max(initial=-1)) + 1
-    distance = np.linalg.norm(snapshot.points_mm - snapshot.lines.laser_mm[snapshot.line], axis=1)
-    nearest_first = np.argsort(distance[high], kind="stable")
-    farthest_first = np.argsort(-distance[low], kind="stable")
+    above, below = (
+        np.linalg.norm(snapshot.points_mm[ends] - snapshot.lines.laser_mm[snapshot.line[ends]], axis=1)
+        for ends in (high, low)
+    )
+    nearest_first = np.argsort(above, kind="stable")
+    farthest_first = np.argsort(-below, kind="stable")
     top_gap, bottom_gap = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
     top_gap[of_gap[nearest_first[::-1]]] = nearest_first[::-1]  # the last one written stays
     bottom_gap[of_gap[farthest_first[::-1]]] = farthest_first[::-1]

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from numba import njit
 
 from drivers.scanline import BoolArray, Float64Array, read_only
-from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.analysis.snapshot import Int32Array, MapSnapshot
+from scanner_service.rescan.frames import Frames
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.stations import IntArray, Stations
 
@@ -31,7 +32,8 @@ class Strips:
     consecutive points around the point in its own line (NaN: it stands alone), `line_spacing_mm` (n,) the nominal Δs,
     `nominal_point_spacing_mm` (n,) the median spacing of the line, or of its pass where the line has one point only.
     `reach_mm` (n,) is the radius of the point's rule before any growing. `group` (n,) numbers the point's pass,
-    `along` (p, 3) is each pass's direction of the line, `order` (n,) the points by line and place in the line.
+    `order` (n,) are the points by line and place in the line, `beside` (n, 2) those before and after each in its line,
+    however far (-1: none).
     """
 
     chain: IntArray
@@ -42,29 +44,28 @@ class Strips:
     nominal_point_spacing_mm: Float64Array
     reach_mm: Float64Array
     group: IntArray
-    along: Float64Array
     order: IntArray
+    beside: IntArray
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
             read_only(getattr(self, name))
 
 
-def strips_of(snapshot: MapSnapshot, stations: Stations, requirement: Requirement) -> Strips:
+def strips_of(snapshot: MapSnapshot, stations: Stations, frames: Frames, requirement: Requirement) -> Strips:
     """Measure the strips on both sides of every counted point."""
     lines, line = snapshot.lines, snapshot.line
-    spacing = _point_spacing_of_lines(snapshot, stations)
+    spacing = stations.point_spacing_mm
     order = np.lexsort((snapshot.index, line)).astype(np.int64)
     c = requirement.radius_constant_mm
     grown = np.sqrt(2.0) * np.fmax(lines.line_spacing_mm, spacing)[line] + c
     reach = np.fmin(snapshot.radius_mm, grown)
     search = requirement.search_mm
     r_max = np.maximum(20.0 * c, 3.0 * reach) if search is None else np.full(len(snapshot), search)
-    along = _directions(snapshot, stations, order)
     counted = snapshot.neighbours > 0
     link = np.full((len(snapshot), 2), -1, dtype=np.int64)
     width = np.full((len(snapshot), 2), np.nan)
-    u = np.einsum("ij,ij->i", snapshot.points_mm, along[stations.group[line]]) if len(snapshot) else np.zeros(0)
+    u = (snapshot.points_mm * frames.along[stations.group[line]]).sum(axis=1) if len(snapshot) else np.zeros(0)
     rows = np.flatnonzero(counted)
     rows = rows[np.lexsort((u[rows], line[rows]))]
     start = np.searchsorted(line[rows], np.arange(len(lines) + 1)).astype(np.int64)
@@ -87,53 +88,30 @@ def strips_of(snapshot: MapSnapshot, stations: Stations, requirement: Requiremen
         nominal_point_spacing_mm=spacing[line],
         reach_mm=reach,
         group=stations.group[line],
-        along=along,
         order=order,
+        beside=_beside(line, order),
     )
 
 
 def in_a_row(snapshot: MapSnapshot, strips: Strips, rows: IntArray, across: BoolArray) -> BoolArray:
     """Whether points have a near neighbour on both sides: along their line where `across`, in the lines beside else."""
-    order = strips.order
-    step = np.linalg.norm(np.diff(snapshot.points_mm[order], axis=0), axis=1)
-    near: BoolArray = np.logical_and(np.diff(snapshot.line[order]) == 0, step <= strips.reach_mm[order[1:]])
-    along = np.zeros(len(snapshot), dtype=bool)
-    along[order[1:-1]] = near[1:] & near[:-1]
-    over_lines = np.all(strips.width_mm <= strips.reach_mm[:, None], axis=1)
-    row: BoolArray = np.where(across, along[rows], over_lines[rows])
+    before, after = strips.beside[rows].T
+    near: BoolArray = (before >= 0) & (after >= 0)
+    for first, second in ((before, rows), (rows, after)):
+        step = np.linalg.norm(snapshot.points_mm[second] - snapshot.points_mm[first], axis=1)
+        near &= step <= strips.reach_mm[second]
+    over_lines = np.all(strips.width_mm[rows] <= strips.reach_mm[rows, None], axis=1)
+    row: BoolArray = np.where(across, near, over_lines)
     return row
 
 
-def _point_spacing_of_lines(snapshot: MapSnapshot, stations: Stations) -> Float64Array:
-    """(L,) the line's point spacing, or the median of its pass where the line itself has none (or 0); else NaN."""
-    spacing = np.where(snapshot.lines.point_spacing_mm > 0, snapshot.lines.point_spacing_mm, np.nan)
-    for number in np.unique(stations.group[np.isnan(spacing)]):
-        rows = stations.group == number
-        known = spacing[rows & np.isfinite(spacing)]
-        if len(known):
-            spacing[rows & np.isnan(spacing)] = np.median(known)
-    return spacing
-
-
-def _directions(snapshot: MapSnapshot, stations: Stations, order: IntArray) -> Float64Array:
-    """(p, 3) unit direction from the first to the last points of the lines of each pass; x where it has no extent."""
-    passes = int(stations.group.max(initial=-1)) + 1
-    along = np.tile([1.0, 0.0, 0.0], (passes, 1))
-    if not len(order):
-        return along
-    line = snapshot.line[order]
-    borders = np.flatnonzero(np.diff(line)) + 1
-    first, last = np.concatenate([[0], borders]), np.concatenate([borders, [len(line)]]) - 1
-    chord = snapshot.points_mm[order[last]] - snapshot.points_mm[order[first]]
-    group = stations.group[line[first]]
-    for number in np.unique(group):
-        mine = chord[group == number]
-        longest = mine[np.argmax(np.einsum("ij,ij->i", mine, mine))]
-        total = (mine * np.sign(mine @ longest)[:, None]).sum(axis=0)
-        length = float(np.linalg.norm(total))
-        if length > 0:
-            along[number] = total / length
-    return along
+def _beside(line: Int32Array, order: IntArray) -> IntArray:
+    """(n, 2) points before and after each in its own line."""
+    beside = np.full((len(order), 2), -1, dtype=np.int64)
+    same = np.diff(line[order]) == 0
+    beside[order[1:][same], 0] = order[:-1][same]
+    beside[order[:-1][same], 1] = order[1:][same]
+    return beside
 
 
 def _along_the_line(

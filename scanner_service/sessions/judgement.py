@@ -10,10 +10,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
+import numpy as np
+
+from drivers.scanline import SensorGeometry
 from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.followed import Change, RegionBook
 from scanner_service.rescan.region import RegionStatus
+from scanner_service.rescan.regions import RegionFinder, RegionReport
 from scanner_service.rescan.requirement import Requirement
+from scanner_service.rescan.stations import IntArray
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionError
 from scanner_service.sessions.left_regions import (
@@ -25,7 +31,7 @@ from scanner_service.sessions.left_regions import (
 )
 from scanner_service.sessions.mirror import Mirror
 from scanner_service.sessions.references import Nominal
-from scanner_service.sessions.results import Results, judge
+from scanner_service.sessions.results import Results, conclude
 from scanner_service.sessions.sources import Source
 from scanner_service.sessions.updates import VerdictBook
 
@@ -64,6 +70,8 @@ class Judgement:
         self._judging = threading.Lock()
         self._in_force = threading.Lock()  # of the regions and the results
         self._mirror = Mirror()
+        self._finder: RegionFinder | None = None
+        self._seen_from: tuple[object, ...] = ()  # what the finder judges by
         self._mirroring = threading.Lock()
 
     def results(self) -> Results | None:
@@ -103,16 +111,9 @@ class Judgement:
             with self._mirroring:
                 read_s = self._now_s()
                 self._mirror.catch_up(self._ask, self._ask_between)
-                snapshot = self._mirror.snapshot()
-            nominal = self._nominal
-            found = judge(
-                snapshot,
-                self._requirement,
-                source.geometry,
-                source.towards_sensor,
-                nominal.surface,
-                nominal.refused,
-            )
+                snapshot, changed = self._mirror.snapshot(), self._mirror.take_changed()
+            report = self._find_regions(snapshot, changed.astype(np.int64), source)
+            found = conclude(snapshot, self._requirement, report, self._nominal.surface, self._nominal.refused)
             with self._in_force:
                 results, changes = self._follow(found)
             self._tell(changes)
@@ -125,6 +126,19 @@ class Judgement:
             results = self._results = self._followed(results)  # somebody may have marked a region meanwhile
             self._read_s = read_s
         return results
+
+    def _find_regions(self, snapshot: MapSnapshot, changed: IntArray, source: Source) -> RegionReport:
+        """The regions of the map, of which these rows have changed; found from nothing when it is seen otherwise."""
+        towards = source.towards_sensor
+        seen_from = _values_of(source.geometry), None if towards is None else tuple(towards.tolist())
+        if self._finder is None or seen_from != self._seen_from:
+            self._finder = RegionFinder(self._requirement, source.geometry, towards_sensor=towards)
+            self._seen_from = seen_from
+        try:
+            return self._finder.find(snapshot, changed)
+        except BaseException:
+            self._finder = None  # what it knows is half renewed
+            raise
 
     def mark_region(self, region_id: int, status: RegionStatus, why: str) -> None:
         """Say of a region that it is unreachable, or that it is not after all; written down.
@@ -179,3 +193,11 @@ class Judgement:
 
     def _ask_between(self, question: Callable[[LiveMap], T]) -> T:
         return self._engine.ask_between(lambda engine: question(engine.live_map)).result()
+
+
+def _values_of(geometry: SensorGeometry | None) -> tuple[object, ...]:
+    """A geometry as numbers that can be compared."""
+    if geometry is None:
+        return ()
+    laser_mm, camera_mm = np.asarray(geometry.laser_mm), np.asarray(geometry.camera_mm)
+    return (*laser_mm.tolist(), *camera_mm.tolist(), *geometry.range_mm, geometry.noise_mm)

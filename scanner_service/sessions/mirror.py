@@ -51,6 +51,7 @@ class Mirror:
         self._place: Int32Array = np.empty(0, dtype=np.int32)
         self._total = 0
         self._latest: Records | None = None
+        self._changed: list[Int32Array] = []
 
     def catch_up(self, ask: Ask, ask_between: Ask) -> int:
         """Take in everything that the engine was given before this call; returns how many rows were copied.
@@ -63,6 +64,7 @@ class Mirror:
             news = ask(partial(_news_since, version=self.version))
             self._make_room(news.total)
             copied += len(news.rows)
+            self._changed.append(news.rows)
             if news.records is not None:
                 self._put(news.rows, news.records)
                 self.version, self._total = news.version, news.total
@@ -77,6 +79,14 @@ class Mirror:
         assert self._latest is not None
         whole = slice(0, self._total)
         return replace(self._latest, points=self._points[whole].copy(), place=self._place[whole].copy()).describe()
+
+    def take_changed(self) -> Int32Array:
+        """The rows (k,) of the snapshot, rising, that are new or other than when this was asked last; once each."""
+        is_in = np.zeros(self._total, dtype=np.bool_)
+        for rows in self._changed:
+            is_in[rows] = True
+        self._changed.clear()
+        return np.flatnonzero(is_in).astype(np.int32)
 
     def _make_room(self, total: int) -> None:
         """Room for so many rows, and for half as many more, so that a growing map is not copied every time."""

@@ -106,6 +106,17 @@ def judge(
     `reference_refused` says why there is no reference although one was asked for.
     """
     report = find_regions(snapshot, requirement, geometry, towards_sensor=towards_sensor)
+    return conclude(snapshot, requirement, report, reference, reference_refused)
+
+
+def conclude(
+    snapshot: MapSnapshot,
+    requirement: Requirement,
+    report: RegionReport,
+    reference: ReferenceSurface | None = None,
+    reference_refused: str | None = None,
+) -> Results:
+    """The results of a snapshot whose regions have been found."""
     measured, refused = None, reference_refused
     if reference is not None:
         try:

@@ -1,0 +1,140 @@
+"""The law of a map that grows: regions found again and again are those found from nothing, after any lines."""
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from drivers.scanline import Scanline, SensorGeometry
+from scanner_service.analysis.intake import StoredLine, quantise
+from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.rescan.regions import RegionFinder, find_regions
+from scanner_service.rescan.requirement import Interest, Requirement
+from scanner_service.sessions.mirror import Mirror
+from tests.unit.rescan.synthetic_scan import Height
+
+GEOMETRY = SensorGeometry(np.array([0.0, 0.0, 100.0]), np.array([0.0, 50.0, 100.0]), (-4.0, 8.0), 0.005)
+
+SURFACES: dict[str, Height] = {
+    "roof": lambda x, y: 2.2 * np.minimum(y, 8.0 - y),
+    "step across": lambda x, y: np.where(y > 4.0, 3.0, 0.0),
+    "step along": lambda x, y: np.where(x + 0.3 * y > 1.0, 2.5, 0.0),
+    "pit": lambda x, y: np.where(x**2 + (y - 4.0) ** 2 < 3.0, -3.0, 0.1 * x),
+    "hole": lambda x, y: np.where(x**2 + (y - 4.0) ** 2 < 3.0, np.nan, 0.0),
+    "post": lambda x, y: np.where(x**2 + (y - 4.0) ** 2 < 2.0, 5.0, 0.0),
+}
+REQUIREMENTS = {
+    "default": Requirement(region_area_mm2=0.2),
+    "line spacing": Requirement(line_spacing_mm=0.35, region_area_mm2=0.2),
+    "chord and incidence": Requirement(chord_error_mm=0.02, incidence_rad=0.9, region_area_mm2=0.2),
+    "interest": Requirement(density_per_mm2=20.0, interest=Interest((-2.0, 1.0, -9.0), (3.0, 7.0, 9.0))),
+}
+
+
+@st.composite
+def passes(draw: st.DrawFn) -> list[StoredLine]:
+    """Lines of one to three passes over one surface, each in its own direction, some lost, stopped or late."""
+    surface = SURFACES[draw(st.sampled_from(sorted(SURFACES)))]
+    rng = np.random.default_rng(draw(st.integers(0, 2**16)))
+    lines = []
+    for number in range(draw(st.integers(1, 3))):
+        turned, backward = draw(st.booleans()), draw(st.booleans())
+        spacing = draw(st.sampled_from([0.3, 0.45]))
+        stations = np.arange(0.5, 7.5, spacing)
+        if draw(st.booleans()):
+            stations[len(stations) // 2 :] += 2.0 * spacing  # a jump: too fast, or lines lost
+        if draw(st.booleans()):
+            stations = np.insert(stations, 5, stations[4])  # the stage stood still
+        stations = stations[::-1] if backward else stations
+        lost = set(rng.choice(len(stations), size=draw(st.integers(0, 3)), replace=False).tolist())
+        order = [at for at in range(len(stations)) if at not in lost]
+        if draw(st.booleans()):
+            late = order.pop(3)
+            order.insert(8, late)
+        lines += [_line(surface, number, at, stations[at], spacing, turned, rng) for at in order]
+    return lines
+
+
+def _line(
+    surface: Height, number: int, at: int, station: float, spacing: float, turned: bool, rng: np.random.Generator
+) -> StoredLine:
+    along = np.arange(-4.0, 4.0, 0.2)
+    across = np.full_like(along, station)
+    x, y = (across - 4.0, along + 4.0) if turned else (along, across)
+    z = surface(x, y) + 0.005 * rng.standard_normal(len(x))
+    seen = np.isfinite(z) & (rng.random(len(x)) > 0.03) & (rng.random() > 0.05)
+    travel = np.array([1.0, 0.0, 0.0]) if turned else np.array([0.0, 1.0, 0.0])
+    line = Scanline(
+        device_id="A",
+        boot_id=1,
+        pass_index=number,
+        line_index=at,
+        device_time_s=0.0,
+        points_mm=np.column_stack([x, y, z]),
+        missing=~seen,
+        laser_mm=np.array([station - 4.0, 4.0, 100.0]) if turned else np.array([0.0, station, 100.0]),
+        plane_normal=travel,
+        travel=travel,
+        position_mm=station,
+        line_spacing_mm=spacing,
+        step_mm=spacing,
+    )
+    return quantise(line, np.zeros(3))
+
+
+def same(one: Any, other: Any, name: str = "") -> None:
+    """Equal to the last bit, NaN where NaN."""
+    if isinstance(one, np.ndarray):
+        np.testing.assert_array_equal(one, other, err_msg=name)
+    elif isinstance(one, tuple):
+        assert len(one) == len(other), name
+        for a, b in zip(one, other, strict=True):
+            same(a, b, name)
+    elif hasattr(one, "__dataclass_fields__"):
+        for item in fields(one):
+            same(getattr(one, item.name), getattr(other, item.name), f"{name}.{item.name}")
+    else:
+        assert repr(one) == repr(other), name
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@given(
+    lines=passes(),
+    asked=st.sampled_from(sorted(REQUIREMENTS)),
+    known=st.booleans(),
+    closed=st.booleans(),
+    withdrawn=st.booleans(),
+    data=st.data(),
+)
+def test_regions_found_again_are_those_found_from_nothing(
+    lines: list[StoredLine], asked: str, known: bool, closed: bool, withdrawn: bool, data: st.DataObject
+) -> None:
+    requirement = REQUIREMENTS[asked]
+    seen = (GEOMETRY, None, np.array([0.0, 0.0, 1.0])) if known else (None, 0.005, None)
+    live, mirror, finder = (
+        LiveMap(MapSettings(noise_mm=0.005, max_points=20_000)),
+        Mirror(),
+        RegionFinder(requirement, *seen),
+    )
+    reads = data.draw(st.sets(st.integers(0, len(lines) - 1), min_size=2, max_size=6))
+
+    def check() -> None:
+        mirror.catch_up(lambda question: question(live), lambda question: question(live))
+        snapshot = mirror.snapshot()
+        again = finder.find(snapshot, mirror.take_changed().astype(np.int64))
+        same(again, find_regions(snapshot, requirement, *seen))
+
+    for number, line in enumerate(lines):
+        if closed and number and line.pass_index != lines[number - 1].pass_index:
+            live.close_all_passes()
+        live.add(line)
+        if number in reads:
+            check()
+    live.close_all_passes()
+    check()
+    if withdrawn:
+        live.withdraw_pass(("A", 1, 0))
+        check()
+    live.close()
