@@ -241,7 +241,7 @@ def test_closing_on_a_dead_disk_says_how_many_lines_are_not_confirmed(tmp_path: 
     assert record.close(timeout_s=0.05) == 4
     for future in futures:
         with pytest.raises(RecordClosed):
-            future.result(timeout_s=0)
+            future.result(timeout_s=60)
     with pytest.raises(RecordClosed):
         record.append(session, line_of(9))
     record.close()
