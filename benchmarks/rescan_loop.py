@@ -20,7 +20,7 @@ from benchmarks.rescan_scan import (
     reach_of,
     subject_of,
 )
-from drivers.scanline import BoolArray, Float64Array, Pose
+from drivers.scanline import Float64Array, Pose
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.experience import chances_of
 from scanner_service.rescan.passes.looks import look_of
@@ -37,6 +37,10 @@ from simulators.optics import LaserLineScanner, demo_scanner
 FIRST_SPACING_MM = 0.35
 RASTER_SPACINGS_MM = (0.35, 0.28, 0.22, 0.17, 0.12)
 GOAL = 0.99
+STILL_PASSES, STILL_SHARE = 8, 0.001
+"""Largest hole first ends when so many passes brought less than this share of the surface."""
+LEAST_MM2 = 2.0
+"""What promises less promises nothing: a plan recommends no pass that brings less."""
 LOST = 2.5
 """Other ways are followed until they took this many times as long as the loop in all."""
 MAX_PASSES = 40
@@ -100,7 +104,7 @@ def largest_hole_first(subject: Subject, reach: Reach, scanner: LaserLineScanner
             if np.isfinite(region.normal).all()
             and all(float(np.linalg.norm(region.centroid_mm - place)) > 2.0 for place in tried)
         ]
-        if not regions or scan.run.coverage[-1] >= GOAL:
+        if not regions or scan.run.coverage[-1] >= GOAL or _stands_still(scan.run):
             break
         region = regions[0]
         tried.append(region.centroid_mm)
@@ -116,6 +120,11 @@ def largest_hole_first(subject: Subject, reach: Reach, scanner: LaserLineScanner
 
         scan.drive(pose_at, float(outline[:, 1].min()) - 1.0, float(outline[:, 1].max()) + 1.0, 0.22)
     return scan.run
+
+
+def _stands_still(run: Run) -> bool:
+    """True when the last passes together brought nothing worth their time."""
+    return len(run.coverage) > STILL_PASSES and run.coverage[-1] - run.coverage[-1 - STILL_PASSES] < STILL_SHARE
 
 
 def judged(scan: Scan, scanner: LaserLineScanner) -> tuple[MapSnapshot, RegionReport]:
@@ -154,9 +163,8 @@ def closed_loop(
         outcome: Outcome = reckon(chosen, was, was_report, snapshot, report, optics)
         tried = tried.and_also(outcome.missed_mm, outcome.empty_mm)
         earlier.append(outcome)
-        scan.run.explores.append(chosen.explores)
-        scan.run.promised_mm2.append(outcome.promised_mm2)
-        scan.run.reached_mm2.append(outcome.reached_mm2)
+        for name in ("promised_mm2", "reached_mm2", "expected_mm2", "found_mm2", "besides_mm2"):
+            getattr(scan.run, name).append(getattr(outcome, name))
         scan.run.true_gain_mm2.append(scan.truth.met_mm2 - before)
         tell(_told(scan, chosen, outcome, plan, reach))
     return scan.run, scan, plan
@@ -167,7 +175,8 @@ def _told(scan: Scan, chosen: RecommendedPass, outcome: Outcome, plan: Plan, rea
     kinds = ", ".join(f"{one.evidence.name.lower()} {one.reached_mm2:.0f}/{one.asked_mm2:.0f}" for one in outcome.kinds)
     return (
         f"  pass {len(run.seconds)}: {run.seconds[-1]:.1f} s, {run.coverage[-1]:.2%}, promised "
-        f"{outcome.promised_mm2:.0f}, reached {outcome.reached_mm2:.0f} and {outcome.besides_mm2:.0f} besides "
+        f"{outcome.promised_mm2:.0f}, reached {outcome.reached_mm2:.0f}, expected {outcome.expected_mm2:.0f}, found "
+        f"{outcome.found_mm2:.0f}, {outcome.besides_mm2:.0f} besides "
         f"({kinds}), truth {run.true_gain_mm2[-1]:.0f} mm2, "
         f"tilt {math.degrees(reach.tilt_rad(chosen.start_pose.rotation)):.0f}, spacing {chosen.line_spacing_mm:.3f}, "
         f"needed {plan.needed_mm2:.0f}, planned in {run.planning_s[-1]:.2f} s"
@@ -179,24 +188,28 @@ def _ended(run: Run) -> str:
 
 
 def promises_of(run: Run) -> dict[str, dict[str, float]]:
-    """How far reached was from promised, by the service's own reckoning: passes that promise, that explore, and all.
+    """How far reached was from promised, by the service's own reckoning, and found from expected where it explored.
 
-    `median_error` is the median of |reached - promised| / promised over the passes.
+    `median_error` is the median of |reached - promised| / promised over the passes that promise at least LEAST_MM2.
+    `all` takes what was promised and what was expected together.
     """
-    promised, reached, explores = (np.array(one) for one in (run.promised_mm2, run.reached_mm2, run.explores))
-    found = {}
-    for name, mine in (("firm", ~explores), ("exploring", explores), ("all", np.ones(len(promised), dtype=np.bool_))):
-        found[name] = _errors(promised, reached, mine)
-    return found
-
-
-def _errors(promised_mm2: Float64Array, reached_mm2: Float64Array, mine: BoolArray) -> dict[str, float]:
-    promised, reached = promised_mm2[mine], reached_mm2[mine]
-    error = np.abs(reached - promised) / promised
+    promised, reached, expected, found = (
+        np.array(one) for one in (run.promised_mm2, run.reached_mm2, run.expected_mm2, run.found_mm2)
+    )
     return {
-        "passes": float(mine.sum()),
-        "promised_mm2": float(promised.sum()),
-        "reached_mm2": float(reached.sum()),
+        "promised": _errors(promised, reached),
+        "explored": _errors(expected, found),
+        "all": _errors(promised + expected, reached + found),
+    }
+
+
+def _errors(said_mm2: Float64Array, came_mm2: Float64Array) -> dict[str, float]:
+    counts = said_mm2 >= LEAST_MM2
+    error = np.abs(came_mm2[counts] - said_mm2[counts]) / said_mm2[counts]
+    return {
+        "passes": float(counts.sum()),
+        "said_mm2": float(said_mm2.sum()),
+        "came_mm2": float(came_mm2.sum()),
         "median_error": float(np.median(error)) if len(error) else math.nan,
     }
 

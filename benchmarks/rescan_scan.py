@@ -43,9 +43,11 @@ class Run:
     way: str
     seconds: list[float] = field(default_factory=list)
     coverage: list[float] = field(default_factory=list)
-    explores: list[bool] = field(default_factory=list)
     promised_mm2: list[float] = field(default_factory=list)
     reached_mm2: list[float] = field(default_factory=list)
+    expected_mm2: list[float] = field(default_factory=list)
+    found_mm2: list[float] = field(default_factory=list)
+    besides_mm2: list[float] = field(default_factory=list)
     true_gain_mm2: list[float] = field(default_factory=list)
     planning_s: list[float] = field(default_factory=list)
 

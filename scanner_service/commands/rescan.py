@@ -102,9 +102,14 @@ def _said(order: dict[str, Any]) -> str:
     if order["outcome"] is None:
         return f"{head}: {order['message'] or order['status']}"
     outcome = order["outcome"]
-    promised = "expected" if outcome["explores"] else "promised"
     doubt = f"; warning: {outcome['doubt']}" if outcome["doubt"] else ""
-    return f"{head}: {promised} {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²{doubt}"
+    explored = (
+        f"; explored: {outcome['found_mm2']:.0f} mm² found of {outcome['expected_mm2']:.0f} mm² expected"
+        if outcome["expected_mm2"] >= 1.0
+        else ""
+    )
+    told = f"promised {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²"
+    return f"{head}: {told}{explored}{doubt}"
 
 
 def _tell_plan(plan: dict[str, Any]) -> None:
@@ -135,7 +140,8 @@ def _served(one: dict[str, Any]) -> str:
     named = [str(item["region"]) for item in one["serves"] if item["region"] is not None]
     regions = f"region{'s' if len(named) > 1 else ''} {', '.join(named)}" if named else ""
     unseen = "unseen surface" if len(named) < len(one["serves"]) else ""
-    unseen += " (explores: what is expected may not be there)" if one["explores"] else ""
+    if one["explores_mm2"] > 0.5 * one["gain_mm2"]:
+        unseen += " (explores: most of what is expected may not be there)"
     return " and ".join(filter(None, (regions, unseen))) or "nothing"
 
 

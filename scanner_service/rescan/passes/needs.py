@@ -27,10 +27,12 @@ _THROUGH = 2.8  # cells: how thick a wall may be of which one side is told by th
 _AROUND = 24
 _BARE = 0.25  # a region is rarely a square around its middle
 _FAR_MM = 4.0  # further than this from known surface hidden space is an empty shadow more often
+_BESIDE = 1.3  # so much more is found beside known surface than there
 _EMPTIED = 0.05  # share of emptied cells around from which on hidden space is a rest
 _SURE = 0.6  # share of solid cells around from which on a rest is taken to begin with surface ...
 _RARE = 0.4  # ... and up to which it rarely does: an edge of a shadow, or a thin rest
-_LEAST_SURE = 0.1
+_LEAST_SURE = 0.2
+_BESIDE_MM = 2.5  # a rest this far from known surface is half as likely as one that touches it
 _ANOTHER = 0.7  # a noisy place is looked at from at most this share of the angle at which it was noisy
 _HEAD_ON_RAD = math.radians(20.0)  # ... and nearer to the normal than this no direction is better
 _OUTNUMBER = 1.25
@@ -58,7 +60,7 @@ FIRM_KINDS = (Evidence.MEASURED, Evidence.FLOOR, Evidence.REFERENCE, Evidence.FR
 
 Chances = tuple[float, ...]
 """Good surface for each mm² that is believed in, by `Evidence`; of hidden space before edges are counted for less."""
-FIRST_CHANCES: Chances = (1.0, 1.0, 1.2, 0.9, 1.0, 0.8, 0.7)
+FIRST_CHANCES: Chances = (1.0, 1.0, 1.2, 0.9, 1.0, 0.8, 1.0)
 """... before a pass has shown it."""
 
 
@@ -196,7 +198,7 @@ def find_needs(
 
 
 Columns = tuple[Float64Array, Float64Array, Float64Array, IntArray, IntArray, Float64Array]
-"""Places, normals, area, region, evidence, and how much nearer to certain each is than its kind (at most 1)."""
+"""Places, normals, area, region, evidence, and how much more or less each is believed in than its kind."""
 
 
 def _measured(surface: KnownSurface) -> Columns:
@@ -248,21 +250,23 @@ def _floors(
 def _frontier(surface: KnownSurface) -> Columns:
     """Where hidden space begins; it belongs to no region.
 
-    What is left of it where passes looked in vain is rarely surface at its edges and where it is thin.
+    What is left of it where passes looked in vain is rarely surface at its edges, where it is thin, and away from known
+    surface.
     """
     n = len(surface.frontier_mm2)
-    sure = np.ones(n)
+    sure = 1.0 / np.maximum(np.abs(surface.frontier_normals).sum(axis=1), 1.0)  # edges of it face askew
     kind = np.full(n, Evidence.FRONTIER, dtype=np.int64)
     if len(surface.points_mm):
-        away, _ = cKDTree(surface.points_mm).query(surface.frontier_mm, distance_upper_bound=_FAR_MM)
-        kind[~np.isfinite(away)] = Evidence.FAR
+        away = np.asarray(cKDTree(surface.points_mm).query(surface.frontier_mm)[0])
+        sure *= _BESIDE - (_BESIDE - 1.0) * np.minimum(away / _FAR_MM, 1.0)
+        kind[away > _FAR_MM] = Evidence.FAR
         low, high = surface.points_mm.min(axis=0), surface.points_mm.max(axis=0)
         off = np.maximum(low - surface.frontier_mm, surface.frontier_mm - high).max(axis=1)
         kind[off > 0.5 * surface.cell_mm] = Evidence.BEYOND
         rest = surface.frontier_emptied > _EMPTIED
         kind[rest] = Evidence.REST
         solid = (surface.frontier_solid[rest] - _RARE) / (_SURE - _RARE)
-        sure[rest] = np.clip(solid, _LEAST_SURE, 1.0)
+        sure[rest] *= np.clip(solid, _LEAST_SURE, 1.0) / (1.0 + (away[rest] / _BESIDE_MM) ** 2)
     none = np.full(n, UNSEEN, dtype=np.int64)
     return surface.frontier_mm, surface.frontier_normals, surface.frontier_mm2, none, kind, sure
 

@@ -63,8 +63,8 @@ class Outcome:
     `besides_mm2` is good surface that was found where nothing was promised. `missed_mm` (k, 3) are the places that the
     pass was to serve and did not, `empty_mm` (e, 3) those of them where hidden space was expected to begin with surface
     and none was found near. `agreement` says how well its points lie on what was known; None: not looked at.
-    `doubt` is what the operator is told when they do not. `explores`: what was promised was mostly an expectation of
-    hidden space.
+    `doubt` is what the operator is told when they do not. `expected_mm2` is what was
+    not promised but expected of hidden space that might be empty, and `found_mm2` what of that was found.
     """
 
     regions: tuple[RegionOutcome, ...]
@@ -73,7 +73,8 @@ class Outcome:
     besides_mm2: float = 0.0
     agreement: Agreement | None = None
     doubt: str | None = None
-    explores: bool = False
+    expected_mm2: float = 0.0
+    found_mm2: float = 0.0
     empty_mm: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
@@ -87,15 +88,16 @@ class Outcome:
 
     @property
     def reached_mm2(self) -> float:
-        """All that meets the requirement now, did not before, and lies where something was promised."""
+        """All that meets the requirement now, did not before, and belongs to a place that was promised."""
         return sum(one.reached_mm2 for one in self.regions)
 
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
         return {
-            "explores": self.explores,
             "promised_mm2": self.promised_mm2,
             "reached_mm2": self.reached_mm2,
+            "expected_mm2": self.expected_mm2,
+            "found_mm2": self.found_mm2,
             "besides_mm2": self.besides_mm2,
             "agreement": self.agreement.to_dict() if self.agreement else None,
             "doubt": self.doubt,
@@ -126,17 +128,17 @@ class Outcome:
         missed, empty = (
             np.array(kept.get(name, ()), dtype=np.float64).reshape(-1, 3) for name in ("missed_mm", "empty_mm")
         )
-        agreement = Agreement.from_dict(kept["agreement"]) if kept.get("agreement") else None
-        besides, doubt = float(kept.get("besides_mm2", 0.0)), kept.get("doubt")
+        doubt = kept.get("doubt")
         return cls(
             regions,
             missed,
             kinds,
-            besides,
-            agreement,
-            None if doubt is None else str(doubt),
-            bool(kept.get("explores")),
-            empty,
+            besides_mm2=float(kept.get("besides_mm2", 0.0)),
+            agreement=Agreement.from_dict(kept["agreement"]) if kept.get("agreement") else None,
+            doubt=None if doubt is None else str(doubt),
+            expected_mm2=float(kept.get("expected_mm2", 0.0)),
+            found_mm2=float(kept.get("found_mm2", 0.0)),
+            empty_mm=empty,
         )
 
 
@@ -180,20 +182,25 @@ def reckon(
     missed[measured] &= ~good
     away, _ = _nearest(done.places_mm[reached > 0], done.places_mm, _BESIDE_MM)
     empty = missed & ~np.isfinite(away) & np.isin(done.place_evidence, HIDDEN_KINDS)
+    promised = done.is_promised
     regions = [
         RegionOutcome(int(region), float(done.place_mm2[mine].sum()), float(reached[mine].sum()))
         for region in np.unique(done.place_regions)
-        if (mine := done.place_regions == region).any()
+        if (mine := promised & (done.place_regions == region)).any()
     ]
     regions.sort(key=lambda one: -one.promised_mm2)
-    besides = float(area_mm2[~is_owned].sum())
-    added = np.setdiff1d(after.lines.pass_number, before.lines.pass_number)
-    agreement = agreement_of(old, after, added)
+    agreement = agreement_of(old, after, np.setdiff1d(after.lines.pass_number, before.lines.pass_number))
     return Outcome(
-        tuple(regions), done.places_mm[missed], _kinds(done, reached), besides, agreement, agreement.doubt(done.turn),
-        done.explores,
-        done.places_mm[empty],
-    )  # fmt: skip
+        tuple(regions),
+        done.places_mm[missed],
+        _kinds(done, reached),
+        besides_mm2=float(area_mm2[~is_owned].sum()),
+        agreement=agreement,
+        doubt=agreement.doubt(done.turn),
+        expected_mm2=float(done.place_mm2[~promised].sum()),
+        found_mm2=float(reached[~promised].sum()),
+        empty_mm=done.places_mm[empty],
+    )
 
 
 def _good_now(old: KnownSurface, after: MapSnapshot, after_report: RegionReport, places_mm: Float64Array) -> BoolArray:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.rig_limits import lines_between
-from drivers.scanline import Float64Array, Pose, read_only
+from drivers.scanline import BoolArray, Float64Array, Pose, read_only
 from scanner_service.rescan.passes.motion import Motion, StraightMotion
 from scanner_service.rescan.passes.needs import FIRM_KINDS, FIRST_CHANCES, UNSEEN, Chances
 from scanner_service.rescan.passes.reach import PartTurn
 
-_UNTRIED = 0.5  # of what its kind promises: less is left of a place that a pass was in vain for
+_UNTRIED = 0.45  # of what its kind promises: less is left of a place that a pass was in vain for
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,18 +82,21 @@ class RecommendedPass:
         return sum(promise.gain_mm2 for promise in self.promises)
 
     @property
-    def explores_mm2(self) -> float:
-        """What of the gain is expected of hidden space that may well be empty; the rest of it is a firm promise."""
-        firm = np.isin(self.place_evidence, FIRM_KINDS)
-        untried = (
-            self.place_mm2 > _UNTRIED * self.place_area_mm2 * np.array(self.chances)[self.place_evidence.astype(int)]
-        )
-        return float(self.place_mm2[~(firm & untried)].sum())
+    def is_promised(self) -> BoolArray:
+        """(k,) the places served that are promised; the others are hidden space that may well be empty: explored."""
+        kind = self.place_evidence.astype(np.int64)
+        untried = self.place_mm2 > _UNTRIED * self.place_area_mm2 * np.array(self.chances)[kind]
+        return np.asarray(np.isin(kind, FIRM_KINDS) & untried)
 
     @property
-    def explores(self) -> bool:
-        """True where most of what is expected is no firm promise: the pass is made to see what is there."""
-        return self.explores_mm2 > 0.5 * self.gain_mm2
+    def promised_mm2(self) -> float:
+        """What of the gain is promised."""
+        return float(self.place_mm2[self.is_promised].sum())
+
+    @property
+    def explores_mm2(self) -> float:
+        """What of the gain is expected of hidden space that may well be empty."""
+        return max(0.0, self.gain_mm2 - self.promised_mm2)
 
     @property
     def gain_per_s(self) -> float:
@@ -141,8 +144,8 @@ class RecommendedPass:
             "laser_direction": (-self.start_pose.rotation[:, 2]).tolist(),
             "turn_part": None if self.turn is None or self.turn.is_none else str(self.turn),
             "gain_mm2": self.gain_mm2,
+            "promised_mm2": self.promised_mm2,
             "explores_mm2": self.explores_mm2,
-            "explores": self.explores,
             "gain_per_s_mm2": self.gain_per_s,
             "serves": [promise.to_dict() for promise in self.promises],
         }
@@ -167,7 +170,7 @@ class Unreachable:
 class Plan:
     """Recommended passes of one version of the map, the best for its time first, and what none of them can bring.
 
-    `needed_mm2` is all that is still wanted, `promised_mm2` what the listed passes are to bring of it.
+    `needed_mm2` is all that is still wanted, `promised_mm2` what the listed passes promise of it.
     `reachable_regions` are those of which some pose sees something; `lost_regions` those of which nothing can be
     brought, with the reason.
     """
@@ -181,8 +184,8 @@ class Plan:
 
     @property
     def promised_mm2(self) -> float:
-        """What the listed passes are to bring together."""
-        return sum(one.gain_mm2 for one in self.passes)
+        """What the listed passes promise together."""
+        return sum(one.promised_mm2 for one in self.passes)
 
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
@@ -190,6 +193,7 @@ class Plan:
             "version": self.version,
             "needed_mm2": self.needed_mm2,
             "promised_mm2": self.promised_mm2,
+            "explores_mm2": sum(one.explores_mm2 for one in self.passes),
             "passes": [one.to_dict() for one in self.passes],
             "unreachable": [one.to_dict() for one in self.unreachable],
         }

@@ -12,6 +12,8 @@ TRIES = 3
 """So often a place is promised before it is given up."""
 LOWERED = 0.25
 """What a pass in vain leaves of the chance that a place is what it seems."""
+EMPTIED = 0.5
+"""... and of the chance of hidden space around."""
 _AROUND_MM = 2.0  # hidden space that goes on this near to where nothing was found
 
 
@@ -48,7 +50,7 @@ class Tried:
         hidden = np.isin(needs.evidence, HIDDEN_KINDS)
         around = np.zeros(len(needs))
         around[hidden] = _times(self.empty_mm, needs.places_mm[hidden], _AROUND_MM)
-        lowered = needs.changed(chance=needs.chance * LOWERED ** np.maximum(times, around))
+        lowered = needs.changed(chance=needs.chance * np.minimum(LOWERED**times, EMPTIED**around))
         return lowered.only(~given_up), needs.only(given_up)
 
 

@@ -73,14 +73,15 @@ export class PassesPanel {
       element("strong", {}, `${one.number}. ${significant(one.gain_mm2)}`, unit("mm²"), ` in ${significant(one.duration_s + one.approach_s, 2)}`, unit("s")),
       element("span", {}, `${significant(one.start_mm)} to ${significant(one.end_mm)}`, unit("mm"), `, ${plural(one.lines, "line", "lines")} ${significant(one.line_spacing_mm)}`, unit("mm"), " apart"),
       element("span", {}, served ? `for ${plural(served, "region", "regions")}` : "for unseen surface"),
-      one.explores ? element("span", {}, "Explores: what is expected may not be there.") : null,
+      one.explores_mm2 > 0.5 * one.gain_mm2 ? element("span", {}, "Explores: most of it may not be there.") : null,
       one.turn_part ? element("span", {}, `First: ${one.turn_part}.`) : null,
       element("button", { type: "button", onclick: () => this.#act(() => acceptPass(this.#id, one.number)) }, "Accept"),
     );
   }
 
   #order({ order, status, message, outcome, pass }) {
-    const said = outcome ? `${outcome.explores ? "expected" : "promised"} ${significant(outcome.promised_mm2)}, reached ${significant(outcome.reached_mm2)} mm²` : (message ?? status);
+    const explored = outcome?.expected_mm2 >= 1 ? `; explored: ${significant(outcome.found_mm2)} found of ${significant(outcome.expected_mm2)} mm² expected` : "";
+    const said = outcome ? `promised ${significant(outcome.promised_mm2)}, reached ${significant(outcome.reached_mm2)} mm²${explored}` : (message ?? status);
     const go = () => this.#act(() => carryOut(this.#id, order, pass.turn_part !== null));
     return element(
       "li.pass",

@@ -84,7 +84,8 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
     desk.wait_for(order)
     assert order.status is PassStatus.DONE
     assert order.reached_end and order.teaches
-    assert order.outcome.promised_mm2 == pytest.approx(one.gain_mm2)
+    assert order.outcome.promised_mm2 == pytest.approx(one.promised_mm2)
+    assert order.outcome.expected_mm2 == pytest.approx(one.explores_mm2)
     assert order.outcome.reached_mm2 > 0.7 * order.outcome.promised_mm2
     assert desk.plan().version > plan.version
     assert desk.plan().needed_mm2 < plan.needed_mm2

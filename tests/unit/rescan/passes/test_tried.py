@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scanner_service.rescan.passes.needs import Evidence, Needs
-from scanner_service.rescan.passes.tried import LOWERED, TRIES, Tried
+from scanner_service.rescan.passes.tried import EMPTIED, LOWERED, TRIES, Tried
 
 CELL_MM = 0.35
 PLACE = np.zeros((1, 3))
@@ -46,6 +46,6 @@ def test_hidden_space_around_where_nothing_was_found_is_believed_in_less_and_sur
     tried = Tried.nothing().and_also(PLACE, PLACE).and_also(PLACE, PLACE)
     for kind in (Evidence.FRONTIER, Evidence.BEYOND):
         needs, given_up = tried.of(wanted(beside, kind), CELL_MM)
-        assert needs.gain_mm2 == pytest.approx([LOWERED**2, 1.0]) and not len(given_up)
+        assert needs.gain_mm2 == pytest.approx([EMPTIED**2, 1.0]) and not len(given_up)
     for kind in (Evidence.MEASURED, Evidence.FLOOR, Evidence.REFERENCE):
         assert tried.of(wanted(beside, kind), CELL_MM)[0].gain_mm2 == pytest.approx([1.0, 1.0])
