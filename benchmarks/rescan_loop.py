@@ -154,7 +154,7 @@ def closed_loop(
         seen = tuple(look for look in looks if look is not None)
         plan = plan_passes(snapshot, report, reach, optics, wishes, scan.standing, tried, seen)
         scan.run.planning_s.append(time.perf_counter() - begun)
-        if not plan.passes or scan.run.coverage[-1] >= 0.9975:
+        if not plan.passes or scan.run.coverage[-1] >= GOAL:
             break
         chosen = plan.passes[0]
         before = scan.truth.met_mm2

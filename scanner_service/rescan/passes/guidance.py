@@ -64,8 +64,10 @@ def reaches_end(wanted: RecommendedPass, laser_sensor_mm: Float64Array, laser_mm
     if len(laser_mm) < max(1.0, _MOST_LINES * wanted.line_count):
         return False
     end = wanted.end_pose.apply(laser_sensor_mm)
-    late = laser_mm[len(laser_mm) // 2 :]
-    return bool((np.linalg.norm(late - end, axis=1) <= _NEAR_MM + wanted.line_spacing_mm).any())
+    before_end_mm = wanted.end_mm - math.copysign(wanted.line_spacing_mm, wanted.end_mm - wanted.start_mm)
+    step_mm = np.linalg.norm(wanted.motion.part_from_sensor(before_end_mm).apply(laser_sensor_mm) - end)
+    late = laser_mm[len(laser_mm) // 2 :]  # the last line may lie up to a step before the end: far, around a turntable
+    return bool((np.linalg.norm(late - end, axis=1) <= _NEAR_MM + step_mm).any())
 
 
 def _say(gone: float, length: float, off: Float64Array, aside: float, angle: float, speed: float, fast: float) -> str:

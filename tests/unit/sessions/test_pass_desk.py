@@ -70,7 +70,7 @@ def told(book, session, kind):
 def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
     session, posed = scanned
     desk = book.pass_desk(session)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     plan = desk.plan()
     order = desk.accept(plan.passes[0].number)
     assert order.status is PassStatus.ACCEPTED
@@ -100,7 +100,7 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
 def test_orders_are_answered_while_a_plan_is_made(book, scanned, monkeypatch):
     session, _ = scanned
     desk = book.pass_desk(session)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     accepted = desk.accept(1)
     begun, answered, waited = threading.Event(), threading.Event(), []
 
@@ -110,7 +110,7 @@ def test_orders_are_answered_while_a_plan_is_made(book, scanned, monkeypatch):
         return plan_passes(*arguments)
 
     monkeypatch.setattr(pass_planning, "plan_passes", slow_plan)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))  # plans anew
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))  # plans anew
     plans = []
     planner = threading.Thread(target=lambda: plans.append(desk.plan()))
     planner.start()
@@ -126,7 +126,7 @@ def test_orders_are_answered_while_a_plan_is_made(book, scanned, monkeypatch):
 def test_a_plan_that_is_overtaken_by_another_rig_is_made_again(book, scanned, monkeypatch):
     session, _ = scanned
     desk = book.pass_desk(session)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     reaches = []
 
     def overtaken(snapshot, report, reach, *others):
@@ -144,7 +144,7 @@ def test_a_plan_that_is_overtaken_by_another_rig_is_made_again(book, scanned, mo
 def test_a_session_between_two_passes_is_not_closed_to_make_room(book, scanned, monkeypatch):
     session, posed = scanned
     desk = book.pass_desk(session)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     order = desk.accept(1)
     desk.carry_out(order.order_id)
     push(session, posed, FROM_ABOVE, -1.0, 1.0, 1.0)
@@ -177,7 +177,7 @@ def test_without_limits_of_the_rig_nothing_is_planned(book, scanned):
 
 def test_what_is_not_in_the_plan_is_refused(book, scanned):
     desk = book.pass_desk(scanned[0])
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     with pytest.raises(PassUnknown, match="no pass 99"):
         desk.accept(99)
     with pytest.raises(PassUnknown, match="no pass order 1"):
@@ -246,7 +246,7 @@ def test_a_turned_pass_over_a_part_that_was_not_turned_is_doubted_until_it_is_wi
 def test_one_pass_is_carried_out_at_a_time(book, scanned):
     session, posed = scanned
     desk = book.pass_desk(session)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     first, second = desk.accept(1), desk.accept(2)
     desk.carry_out(first.order_id)
     push(session, posed, first.planned.motion, first.planned.start_mm, first.planned.end_mm, 1.0)
@@ -279,7 +279,7 @@ def test_one_pass_is_carried_out_at_a_time(book, scanned):
 def test_a_pass_that_was_stopped_or_failed_teaches_nothing(book, scanned, tmp_path, lines_share, failures):
     session, posed = scanned
     desk = book.pass_desk(session)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     plan = desk.plan()
     for failure in failures:
         order = desk.accept(1)
@@ -305,7 +305,7 @@ def test_a_pass_that_was_stopped_or_failed_teaches_nothing(book, scanned, tmp_pa
         later = SessionBook(record)
         reopened = later.pass_desk(later.get(session_id))
         assert not any(order.teaches for order in reopened.orders())
-        reopened.describe_rig(RigSetup(free_reach(), OPTICS))
+        reopened.describe_rig(RigSetup(free_reach(30.0), OPTICS))
         for now in (again, reopened.plan()):
             assert now.passes[0].chances == FIRST_CHANCES
             assert not any("passes that should have seen it" in lost.why for lost in now.unreachable)
@@ -318,7 +318,7 @@ def test_a_pass_that_was_stopped_or_failed_teaches_nothing(book, scanned, tmp_pa
 def test_an_accepted_pass_can_be_cancelled_until_it_is_carried_out(book, scanned):
     session, _ = scanned
     desk = book.pass_desk(session)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     order = desk.accept(1)
     assert desk.cancel(order.order_id).status is PassStatus.CANCELLED
     with pytest.raises(SessionBusy, match="cancelled"):
@@ -331,7 +331,7 @@ def test_an_accepted_pass_can_be_cancelled_until_it_is_carried_out(book, scanned
 def test_orders_outlast_a_restart(book, scanned, tmp_path):
     session, posed = scanned
     desk = book.pass_desk(session)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     done = desk.accept(1)
     desk.carry_out(done.order_id)
     one = done.planned
@@ -356,7 +356,7 @@ def test_orders_outlast_a_restart(book, scanned, tmp_path):
         assert first.map_passes == done.map_passes == [1]
         assert first.reached_end and first.teaches
         assert len(first.outcome.missed_mm) == len(done.outcome.missed_mm)
-        reopened.describe_rig(RigSetup(free_reach(), OPTICS))
+        reopened.describe_rig(RigSetup(free_reach(30.0), OPTICS))
         reopened.carry_out(accepted.order_id)  # what was accepted can still be carried out
         assert reopened.order(accepted.order_id).status is PassStatus.RUNNING
         again.close()
@@ -382,7 +382,7 @@ def test_what_no_pose_sees_is_unreachable_until_the_rig_can_do_more(book, scanne
 def test_regions_can_be_named_and_unknown_ones_are_refused(book, scanned):
     session, _ = scanned
     desk = book.pass_desk(session)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     wanted = max(session.results().regions, key=lambda region: region.area_mm2).region_id
     plan = desk.plan(Serving(regions=frozenset({wanted})))
     assert {promise.region for one in plan.passes for promise in one.promises} == {wanted}
@@ -393,7 +393,7 @@ def test_regions_can_be_named_and_unknown_ones_are_refused(book, scanned):
 def test_a_rig_that_a_client_drives_is_looped_until_a_pass_lies_elsewhere(book, scanned):
     session, posed = scanned
     desk = book.pass_desk(session)
-    desk.describe_rig(RigSetup(free_reach(), OPTICS, driven_by_client=True))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS, driven_by_client=True))
     loop = desk.run_loop(LoopLimits(max_passes=5))
     carried = set()
     while loop.running:
@@ -420,6 +420,6 @@ def raised(line, lift_mm):
 
 def test_a_hand_cannot_be_looped(book, scanned):
     desk = book.pass_desk(scanned[0])
-    desk.describe_rig(RigSetup(free_reach(), OPTICS))
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     with pytest.raises(SessionBusy, match="by hand"):
         desk.run_loop(LoopLimits())

@@ -41,3 +41,10 @@ def test_a_hand_may_be_slow_a_little_aside_and_go_too_far():
     one = wanted(FROM_ABOVE, 40.0)
     slow = lasers(FROM_ABOVE, np.linspace(-5.0, 48.0, 900)) + np.array([1.5, 0.0, 0.0])
     assert reaches_end(one, LASER_MM, slow)
+
+
+def test_the_last_line_around_a_turntable_may_lie_a_line_before_the_end():
+    far = TurningMotion(FROM_ABOVE.at_zero, np.array([1.0, 0.0, 0.0]), 2.0)  # the laser goes 75 times as far
+    one = wanted(far, 8.1)
+    assert reaches_end(one, LASER_MM, lasers(far, np.arange(0.0, 8.01, 0.2)))
+    assert not reaches_end(one, LASER_MM, lasers(far, np.arange(0.0, 7.41, 0.2)))
