@@ -23,7 +23,7 @@ from drivers.protocols.rplidar import (
     STREAMS,
     Answer,
     AnswerDecoder,
-    Capsule,
+    AnyCapsule,
     Command,
     Conf,
     Descriptor,
@@ -110,6 +110,7 @@ class RplidarHost(Conversation):
         super().__init__(deliver, emit, self._answers, boot_id=boot_id, rates=rates)
         self._turns = TurnCollector()
         self._mode: Mode | None = None
+        self._unread: dict[str, int] = {}  # modes whose answers are not understood, by name
         self._has_pwm = False
         self._turn_s = 1.0 / _USUAL_TURN_HZ
         self._clock = DeviceClock(_COUNTER, 1e-6)
@@ -122,9 +123,9 @@ class RplidarHost(Conversation):
             for item in found:
                 if isinstance(item, Damage):
                     self._turns.lost_bytes(item.n_bytes)
-                elif isinstance(item, Sample | Capsule) and self._dialogue is None:
+                elif isinstance(item, Sample | AnyCapsule) and self._dialogue is None:
                     self._collect(item, now_s)
-        return [item for item in found if not isinstance(item, Sample | Capsule)]
+        return [item for item in found if not isinstance(item, Sample | AnyCapsule)]
 
     def _reset_decoder(self) -> list[Damage]:
         self._turns.forget()
@@ -229,11 +230,13 @@ class RplidarHost(Conversation):
         """One mode; None for one whose packets this driver cannot read, or which the lidar does not describe."""
         kind = yield from self._conf("<B", Conf.ANSWER_TYPE, number)
         us_q8 = yield from self._conf("<I", Conf.US_PER_SAMPLE, number)
-        if kind not in STREAMS or not us_q8:
-            return None
         far_q8 = yield from self._conf("<I", Conf.MAX_DISTANCE, number)
         name = yield from self._packet(conf_request(Conf.NAME, number), Answer.CONF)
         text = (name or b"")[4:].split(b"\0")[0].decode("ascii", "replace") or f"mode {number}"
+        if kind not in STREAMS or not us_q8:
+            if kind is not None:
+                self._unread[text.lower()] = kind
+            return None
         far_mm = far_q8 / 256 * 1000 if far_q8 else _USUAL_RANGE_MM
         return Mode(text, kind, us_q8 / 256, far_mm, None if kind == Answer.STANDARD else number)
 
@@ -252,6 +255,11 @@ class RplidarHost(Conversation):
             if mode.name.lower() == wanted or (wanted == "express" and mode.kind != Answer.STANDARD):
                 return mode
         names = ", ".join(dict.fromkeys(mode.name for mode in modes))
+        if wanted in self._unread:
+            raise ScannerRefused(
+                f"mode {self._options.mode!r} of this lidar sends answers of type {self._unread[wanted]:02X}h, "
+                f"which this driver does not read; choose one of {names}"
+            )
         raise ScannerRefused(f"this lidar has no mode {self._options.mode!r}; its modes are {names}")
 
     def _begin(self) -> Script[None]:
@@ -297,7 +305,7 @@ class RplidarHost(Conversation):
     def _take(self, item: Any, now_s: float) -> None:
         """All that comes while it streams is taken as it is decoded."""
 
-    def _collect(self, item: Sample | Capsule, now_s: float) -> None:
+    def _collect(self, item: Sample | AnyCapsule, now_s: float) -> None:
         """Take a sample or a capsule, and the turn that it ends."""
         turn = self._turns.sample(item) if isinstance(item, Sample) else self._turns.capsule(item)
         if self._turns.implausible > self._told_implausible:

@@ -13,7 +13,7 @@ scans = [lidar.get_scan_data() for _ in range(int(sys.argv[3]))]
 lidar.stop_scan()
 lidar.disconnect()
 found = {
-    "info": [info.model, info.firmware, info.hardware, info.serial_number],
+    "info": [info.model, info.firmware_version, info.hardware_version, info.serial_number],
     "health": [str(health.status), health.error_code],
     "scans": [[list(column) for column in scan] for scan in scans if scan is not None],
 }
