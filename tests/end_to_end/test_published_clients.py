@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from simulators.devices.rplidar import A1, A3, S1, Model, RplidarDevice
-from simulators.devices.scip import URG_04LX, ScipDevice
+from simulators.devices.scip import ScipDevice
+from simulators.devices.scip_scans import URG_04LX
 from simulators.pty_port import PtyPort
 
 CLIENTS = Path(__file__).parent / "clients"

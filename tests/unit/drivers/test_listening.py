@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from drivers.protocols.listening import LISTENED_S, listened_s
 from drivers.protocols.scanner_events import Disconnected, PassEnded
-from drivers.protocols.scip_host import ScipHost, ScipOptions
+from drivers.protocols.scip_host import ScipHost
+from drivers.protocols.scip_plan import ScipOptions
 from drivers.protocols.stage_events import PositionLost
 from drivers.protocols.stage_host import Phase
 from simulators.devices.scip import ScipDevice

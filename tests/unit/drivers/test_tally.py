@@ -7,13 +7,14 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.boot_ledger import BootLedger, Kind
 from drivers.protocols.framing import Damage, DamageReason
 from drivers.protocols.native import Decoder, encode
 from drivers.protocols.native_messages import Chunk, EndReason, Hello, PositionKind, Status
 from drivers.protocols.native_stream import ProfileStream
 from drivers.protocols.unwrap import increase_u32, unwrap_u32
 from drivers.scanline import DeviceInfo, Profile, SensorGeometry
-from drivers.tally import OTHER_PASSES, BootLedger, Kind, PassTally, Tally
+from drivers.tally import OTHER_PASSES, PassTally, Tally
 
 U32 = 2**32
 GEOMETRY = SensorGeometry(np.zeros(3), np.zeros(3), (-1.0, 1.0), 0.001)
