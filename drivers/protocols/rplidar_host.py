@@ -5,14 +5,13 @@ A lidar is asked only for what its firmware is known to have. Its motor is switc
 """
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from drivers.errors import ScannerRefused, ScannerTimeout
-from drivers.protocols.conversation import Conversation
+from drivers.protocols.conversation import Conversation, Listener
 from drivers.protocols.device_clock import DeviceClock
 from drivers.protocols.dialogue import Answer as Awaited
 from drivers.protocols.dialogue import Pause, Quiet, Script
@@ -33,8 +32,7 @@ from drivers.protocols.rplidar import (
     request,
 )
 from drivers.protocols.rplidar_turns import Turn, TurnCollector
-from drivers.protocols.scanner_events import ScannerEvent
-from drivers.scanline import DeviceInfo, Profile, SensorGeometry
+from drivers.scanline import DeviceInfo, SensorGeometry
 
 RATES = (115_200, 256_000, 460_800, 1_000_000)
 USUAL_PWM = 660
@@ -98,16 +96,11 @@ class RplidarHost(Conversation):
     silent_after_s = 2.0
 
     def __init__(
-        self,
-        deliver: Callable[[Profile], bool],
-        emit: Callable[[ScannerEvent], None],
-        boot_id: int,
-        rates: tuple[int, ...] = RATES,
-        options: RplidarOptions | None = None,
+        self, listener: Listener, rates: tuple[int, ...] = RATES, options: RplidarOptions | None = None
     ) -> None:
         self._options = options or RplidarOptions()
         self._answers = AnswerDecoder(signed_offsets=self._options.signed_offsets)
-        super().__init__(deliver, emit, self._answers, boot_id=boot_id, rates=rates)
+        super().__init__(listener, self._answers, rates)
         self._turns = TurnCollector()
         self._mode: Mode | None = None
         self._unread: dict[str, int] = {}  # modes whose answers are not understood, by name

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from drivers.errors import ScannerRefused, ScannerSilent, ScannerTimeout
-from drivers.protocols.conversation import Conversation
+from drivers.protocols.conversation import Conversation, Listener
 from drivers.protocols.device_clock import DeviceClock
 from drivers.protocols.dialogue import Answer, Quiet, Script
 from drivers.protocols.framing import Damage, DamageReason
 from drivers.protocols.polar import reasons_of, sensor_from_polar
-from drivers.protocols.scanner_events import ScannerEvent
 from drivers.protocols.scip import (
     CLOCK_SPAN,
     CLOCK_TICK_S,
@@ -30,7 +29,7 @@ from drivers.protocols.scip import (
 )
 from drivers.protocols.scip_echoes import ECHO_STREAMS, NONE, EchoScan, echoes_of
 from drivers.protocols.scip_plan import RATES, Parameters, Request, ScipOptions, parameters_of, request_for
-from drivers.scanline import DeviceInfo, Profile, SensorGeometry
+from drivers.scanline import DeviceInfo, SensorGeometry
 
 QUIET_S = 0.14
 """Silence after which a stale stream is taken to have ended; Hokuyo's own client waits as long."""
@@ -43,15 +42,8 @@ _WIDTHS = STREAMS | ECHO_STREAMS
 class ScipHost(Conversation):
     """One conversation with one Hokuyo lidar."""
 
-    def __init__(
-        self,
-        deliver: Callable[[Profile], bool],
-        emit: Callable[[ScannerEvent], None],
-        boot_id: int,
-        rates: tuple[int, ...] = RATES,
-        options: ScipOptions | None = None,
-    ) -> None:
-        super().__init__(deliver, emit, ReplyDecoder(), boot_id=boot_id, rates=rates)
+    def __init__(self, listener: Listener, rates: tuple[int, ...] = RATES, options: ScipOptions | None = None) -> None:
+        super().__init__(listener, ReplyDecoder(), rates)
         self._options = options or ScipOptions()
         self._parameters: Parameters | None = None
         self._request: Request | None = None
