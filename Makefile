@@ -37,7 +37,7 @@ test-long: $(VENV)/installed-dev $(VENV)/emulators
 
 # Coverage-guided, one parser after the other; what it finds interesting stays in tests/fuzz/corpus.
 FUZZ_S ?= 60
-FUZZ ?= native scip lms lms_requests ls100 rplidar rplidar_samples rplidar_capsules
+FUZZ ?= native scip lms lms_requests ls100 rplidar rplidar_samples rplidar_capsules rplidar_ultra
 fuzz: $(VENV)/installed-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[fuzz]'
 	for target in $(FUZZ); do $(BIN)/python -m tests.fuzz $$target -max_total_time=$(FUZZ_S) -max_len=2048 $(ARGS) || exit 1; done

@@ -13,8 +13,6 @@ from drivers.scanners.face import FreeRunningScanner
 from drivers.stages.unmoved import ConstantSpeed
 
 _BACK_S = 120.0
-_ARRIVAL_S = 0.3
-"""A stage is asked a few times a second whether it has arrived; a scanner that runs free goes on meanwhile."""
 _JUDGED_AFTER = 100
 _SPACING_FACTOR = 2.0
 """How many times as far as ordered lines on a conveyor may come apart before the order is nonsense."""
@@ -33,7 +31,6 @@ class MotionPass:
         self._stage_is_back = False  # it was gone and came back since it set off
         self._spacing_is_judged = False
         self._seen: list[Profile] = []  # the first ones, until the spacing is judged
-        self._counted_mm = math.nan  # up to the last round before the stage arrived
 
     def run(self) -> None:
         """Move from end to end while the scanner measures; raises a DriverError when stage or scanner fail."""
@@ -66,7 +63,6 @@ class MotionPass:
             self._stage_is_gone(False)
             if arrived or self._is_beyond():
                 break
-            self._counted_mm = lines.counted_to_mm
         if drive.driven is not None and not drive.stopping.is_set() and not self._by_count:
             drive.await_reading(profiles_too=True)
         lines.settle(is_over=True)
@@ -135,15 +131,15 @@ class MotionPass:
                     f"{order.line_spacing_mm:g} mm; order that spacing, or pair by time"
                 )
             )
-        latest = drive.lines.track.latest
-        if drive.driven is None or latest is None:
+        places = None if drive.driven is None else drive.lines.counted_and_read()
+        if places is None:
             return
-        slack_mm = 2.0 * order.line_spacing_mm + self._speed * _ARRIVAL_S
-        if abs(latest.position_mm - self._counted_mm) > slack_mm:
+        counted_mm, read = places
+        if abs(read.position_mm - counted_mm) > 2.0 * order.line_spacing_mm + read.uncertainty_mm:
             drive.told.event(
                 Advice(
-                    f"the last line was counted to {self._counted_mm:.4g} mm, but the stage stands at "
-                    f"{latest.position_mm:.4g} mm: lines and places do not match; check the trigger, or pair by time"
+                    f"a line was counted to {counted_mm:.4g} mm, but the stage was at {read.position_mm:.4g} mm: lines "
+                    "and places do not match; check the trigger, or pair by time"
                 )
             )
 

@@ -4,11 +4,11 @@ import math
 import threading
 from collections import deque
 from dataclasses import replace
-from itertools import pairwise
 
 from drivers.pairing import ClockOffset, PairedProfile, StagePosition, StageTrack, TimePairing
 from drivers.pass_accounts import PassAccounts, PassReport
 from drivers.passes.left_out import LeftOut
+from drivers.passes.speeds import line_rate_of
 from drivers.passes.told import Told
 from drivers.rig import Rig
 from drivers.rig_description import Pairing
@@ -40,9 +40,7 @@ class PassLines:
         self._counted_since_s = math.inf
         self._first_counted: int | None = None
         self._uncounted: Profile | None = None  # the latest one that was exposed before the stage set off
-        self.counted_to_mm = math.nan
-        """The place that the latest counted profile came to, also beyond the end of the pass; NaN before the first."""
-        self._counted_times: deque[float] = deque(maxlen=1_000)
+        self._counted: deque[tuple[Profile, float]] = deque(maxlen=400)  # and the places they came to
 
     # ---- profiles come in -------------------------------------------------------------------------------------------
 
@@ -72,11 +70,10 @@ class PassLines:
             self._first_counted = self._first_since(profile)
         spacing_mm = self.order.line_spacing_mm
         at_mm = self._counted_from_mm + self.order.sign * (profile.line_index - self._first_counted) * spacing_mm
-        self.counted_to_mm = at_mm
+        self._counted.append((profile, at_mm))
         if (at_mm - self.order.end_mm) * self.order.sign > 0.5 * spacing_mm:
             self.leave_out(profile, "outside_pass")
             return
-        self._counted_times.append(profile.device_time_s)
         self.at_position(profile, StagePosition(at_mm, spacing_mm + speed_mm_per_s * self._latency_s))
 
     def count_from(self, position_mm: float, since_s: float) -> None:
@@ -137,10 +134,23 @@ class PassLines:
 
     @property
     def counted_period_s(self) -> float:
-        """The middle time between profiles that were counted, by the scanner's clock; NaN before there are two."""
-        times = list(self._counted_times)
-        gaps = sorted(later - earlier for earlier, later in pairwise(times))
-        return gaps[len(gaps) // 2] if gaps else math.nan
+        """The middle time from one profile that was counted to the next, by the scanner's clock; NaN of a few."""
+        rate_hz = line_rate_of([profile for profile, _ in self._counted])
+        return math.nan if rate_hz is None else 1.0 / rate_hz
+
+    def counted_and_read(self) -> tuple[float, StagePosition] | None:
+        """Return where the latest profile was counted to of those that saw the stage in motion, and where that was.
+
+        None when there is none. When somebody looks does not matter: both places are those of one exposure.
+        """
+        latest = self.track.latest
+        for profile, at_mm in reversed(self._counted):
+            read = self.track.at(self.exposure_s(profile), self._latency_s)
+            if latest is None or read is None:
+                continue
+            if abs(read.position_mm - latest.position_mm) > read.uncertainty_mm + _EDGE_MM:
+                return at_mm, read
+        return None
 
     def report(self) -> PassReport:
         """The accounts as they stand."""

@@ -51,41 +51,43 @@ class Task:
     failure: ScannerError | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Listener:
+    """Who is told of a conversation, and its number in the record: the devices of these protocols number no boots.
+
+    `deliver` takes a profile, False when it could not, which is counted as `host_overflow`; `emit` takes an event.
+    """
+
+    deliver: Callable[[Profile], bool]
+    emit: Callable[[ScannerEvent], None]
+    boot_id: int
+
+
 class Conversation(Talk):
     """One conversation with one device, over as many links as it takes.
 
     Parameters
     ----------
-    deliver : takes a profile; False when it could not, which is counted as `host_overflow`.
-    emit : takes an event.
+    listener : who is told of it.
     decoder : understands the device's bytes.
-    boot_id : names this conversation in the record; the devices of these protocols have no number for their boots.
     rates : baud rates to try, the likeliest first.
     """
 
     silent_after_s = 2.0
     """A stream without a profile for so long has stopped: the link is then opened anew."""
 
-    def __init__(
-        self,
-        deliver: Callable[[Profile], bool],
-        emit: Callable[[ScannerEvent], None],
-        decoder: Decoder,
-        *,
-        boot_id: int,
-        rates: tuple[int, ...],
-    ) -> None:
-        super().__init__(decoder, lambda text: emit(Advice(text)), rates)
+    def __init__(self, listener: Listener, decoder: Decoder, rates: tuple[int, ...]) -> None:
+        super().__init__(decoder, lambda text: listener.emit(Advice(text)), rates)
         self.info: DeviceInfo | None = None
         self.phase = Phase.CLOSED
         self.failure: ScannerError | None = None
         """Why nobody was met on this link."""
         self.laser_on: bool | None = None
-        self.boot_id = boot_id
-        self._deliver = deliver
-        self._emit = emit
+        self.boot_id = listener.boot_id
+        self._deliver = listener.deliver
+        self._emit = listener.emit
         self._task: Task | None = None
-        self._account = ProfileAccount(boot_id)
+        self._account = ProfileAccount(listener.boot_id)
         self._told_jumps = 0
         self._streaming = False
         self._wanted = False

@@ -71,14 +71,14 @@ class GrblHost(StageHost):
         self._waiting.clear()
         self._asked_s = None
         self._state = None
-        self._step_greeting("look", now_s)
+        self._step_greeting("look")
         self._ask(now_s)
 
-    def _step_greeting(self, step: str, now_s: float) -> None:
-        self._greeting, self._greeting_s = step, now_s
+    def _step_greeting(self, step: str) -> None:
+        self._greeting, self._greeting_s = step, self._listening_s
 
-    def _identify(self, now_s: float) -> None:
-        self._step_greeting("identify", now_s)
+    def _identify(self) -> None:
+        self._step_greeting("identify")
         self._settings.clear()
         self._waiting.clear()
         self._characters.reset()
@@ -86,11 +86,11 @@ class GrblHost(StageHost):
         self._send(b"$$\n")
 
     def _tick_greeting(self, now_s: float) -> None:
-        waited_s = now_s - self._greeting_s
+        waited_s = self._listening_s - self._greeting_s
         match self._greeting:
             case "look" if waited_s > _BANNER_S:
                 self.outbox.put(SOFT_RESET)
-                self._step_greeting("reset", now_s)
+                self._step_greeting("reset")
             case "look" if self._asked_s is None or now_s - self._asked_s > _STEP_S:
                 self._ask(now_s)
             case "halt" if now_s >= self._next_poll_s:
@@ -103,19 +103,19 @@ class GrblHost(StageHost):
         match report.state:
             case State.JOG:
                 self.outbox.overtake(JOG_CANCEL, inside_messages=True)
-                self._step_greeting("halt", now_s)
+                self._step_greeting("halt")
             case State.RUN:
                 self.outbox.overtake(HOLD, inside_messages=True)
-                self._step_greeting("halt", now_s)
+                self._step_greeting("halt")
             case State.HOLD if report.substate == 1:
-                self._step_greeting("halt", now_s)
+                self._step_greeting("halt")
             case State.HOLD | State.SLEEP:  # at rest: what it still holds is thrown away, its position is kept
                 self.outbox.overtake(SOFT_RESET, inside_messages=True)
-                self._step_greeting("reset", now_s)
+                self._step_greeting("reset")
             case State.HOME:
-                self._step_greeting("halt", now_s)
+                self._step_greeting("halt")
             case _ if self._greeting in ("look", "halt"):
-                self._identify(now_s)
+                self._identify()
 
     # ---- what comes -------------------------------------------------------------------------------------------------
 
@@ -150,7 +150,7 @@ class GrblHost(StageHost):
                 self._done()
             self._fail(StageAlarm("the controller was reset in the middle; home before the next motion"))
             self.phase = Phase.GREETING
-        self._identify(now_s)
+        self._identify()
 
     def _acknowledged(self, refusal: Refusal | None, now_s: float) -> None:
         if not self._characters.acknowledged():

@@ -4,14 +4,14 @@ Nothing is written to the scanner's EEPROM: mode, rate and variant hold until it
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from drivers.errors import ScannerRefused, ScannerSilent, ScannerTimeout
-from drivers.protocols.conversation import Conversation
+from drivers.protocols.conversation import Conversation, Listener
 from drivers.protocols.device_clock import DeviceClock
 from drivers.protocols.dialogue import Answer, Pause, Quiet, Script
 from drivers.protocols.framing import Damage, DamageReason
@@ -39,8 +39,7 @@ from drivers.protocols.lms import (
     variant_request,
 )
 from drivers.protocols.polar import reasons_of, sensor_from_polar
-from drivers.protocols.scanner_events import ScannerEvent
-from drivers.scanline import DeviceInfo, Profile, SensorGeometry
+from drivers.scanline import DeviceInfo, SensorGeometry
 
 RATES = (9_600, 38_400, 500_000, 19_200)
 TURN_S = 0.01332
@@ -86,16 +85,9 @@ class LmsHost(Conversation):
 
     break_after_s = 0.15
 
-    def __init__(
-        self,
-        deliver: Callable[[Profile], bool],
-        emit: Callable[[ScannerEvent], None],
-        boot_id: int,
-        rates: tuple[int, ...] = RATES,
-        options: LmsOptions | None = None,
-    ) -> None:
+    def __init__(self, listener: Listener, rates: tuple[int, ...] = RATES, options: LmsOptions | None = None) -> None:
         self._frames = TelegramDecoder()
-        super().__init__(deliver, emit, self._frames, boot_id=boot_id, rates=rates)
+        super().__init__(listener, self._frames, rates)
         self._options = options or LmsOptions()
         self._status: ScannerStatus | None = None
         self._measuring_mode = 0

@@ -3,14 +3,14 @@
 RS-485 has one pair of wires: never is more than one request under way, and an adapter that hears itself is noticed.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from drivers.errors import ScannerRefused, ScannerTimeout
-from drivers.protocols.conversation import Conversation
+from drivers.protocols.conversation import Conversation, Listener
 from drivers.protocols.device_clock import DeviceClock
 from drivers.protocols.dialogue import Answer, Quiet, Script
 from drivers.protocols.framing import Damage, DamageReason
@@ -30,8 +30,7 @@ from drivers.protocols.ls100 import (
     read_request,
     reads_of_profile,
 )
-from drivers.protocols.scanner_events import ScannerEvent
-from drivers.scanline import DeviceInfo, Float64Array, Profile, SensorGeometry
+from drivers.scanline import DeviceInfo, Float64Array, SensorGeometry
 
 RATES = (115_200, 921_600, 9_600, 19_200, 38_400, 57_600, 230_400, 460_800, 2_000_000, 4_000_000)
 _REPLY_S = 0.1
@@ -73,16 +72,9 @@ class Ls100Host(Conversation):
 
     break_after_s = 0.09
 
-    def __init__(
-        self,
-        deliver: Callable[[Profile], bool],
-        emit: Callable[[ScannerEvent], None],
-        boot_id: int,
-        rates: tuple[int, ...] = RATES,
-        options: Ls100Options | None = None,
-    ) -> None:
+    def __init__(self, listener: Listener, rates: tuple[int, ...] = RATES, options: Ls100Options | None = None) -> None:
         self._frames = FrameDecoder()
-        super().__init__(deliver, emit, self._frames, boot_id=boot_id, rates=rates)
+        super().__init__(listener, self._frames, rates)
         self._options = options or Ls100Options()
         self._address = 0
         self._n_points = 0

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from drivers.boot_ledger import BootLedger, Kind
 from drivers.protocols.framing import Damage
 from drivers.protocols.native_messages import (
     NM_PER_MM,
@@ -16,7 +17,7 @@ from drivers.protocols.native_messages import (
     Status,
 )
 from drivers.scanline import DeviceInfo, Profile
-from drivers.tally import BootLedger, Kind, Tally
+from drivers.tally import Tally
 
 
 class OpenLine:

@@ -3,8 +3,9 @@
 Every profile that the device is known to have made has a number, also the lost ones; numbers never go back.
 """
 
+from drivers.boot_ledger import BootLedger, Kind
 from drivers.protocols.framing import Damage
-from drivers.tally import BootLedger, Kind, Tally
+from drivers.tally import Tally
 
 _U32 = 1 << 32
 _MAX_SKIP = 1 << 30  # a gap that is said to be longer is no gap but nonsense

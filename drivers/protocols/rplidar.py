@@ -9,12 +9,13 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import reduce
 from operator import xor
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.protocols.framing import Damage, DamageReason
+from drivers.protocols.rplidar_ultra import ULTRA_BYTES, Following, UltraCapsule, read_ultra
 from drivers.scanline import Float64Array
 
 START = 0xA5
@@ -55,12 +56,14 @@ class Answer(IntEnum):
     CONF = 0x20
     STANDARD = 0x81
     EXPRESS = 0x82
+    ULTRA = 0x84
     DENSE = 0x85
 
 
 class Conf(IntEnum):
     """What GET_LIDAR_CONF may be asked for."""
 
+    DESIRED_TURNS = 0x01
     MODE_COUNT = 0x70
     US_PER_SAMPLE = 0x71
     MAX_DISTANCE = 0x74
@@ -69,15 +72,16 @@ class Conf(IntEnum):
     NAME = 0x7F
 
 
-_LENGTHS = {
+LENGTHS = {
     Answer.INFO: 20,
     Answer.HEALTH: 3,
     Answer.SAMPLERATE: 4,
     Answer.STANDARD: SAMPLE_BYTES,
     Answer.EXPRESS: CAPSULE_BYTES,
     Answer.DENSE: CAPSULE_BYTES,
+    Answer.ULTRA: ULTRA_BYTES,
 }
-STREAMS = (Answer.STANDARD, Answer.EXPRESS, Answer.DENSE)
+STREAMS = (Answer.STANDARD, Answer.EXPRESS, Answer.DENSE, Answer.ULTRA)
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
@@ -137,11 +141,25 @@ class Capsule:
     distance_mm: Float64Array
     offset_q3: npt.NDArray[np.int64]
 
-    def angles_deg(self, next_start_q6: int) -> Float64Array:
-        """Clockwise angles (n,) in degrees, 0 to 360, when the next capsule starts at `next_start_q6`."""
+    @property
+    def n_samples(self) -> int:
+        """How many samples it holds."""
+        return len(self.distance_mm)
+
+    @property
+    def first_code(self) -> int:
+        """None of its distances is told by the next capsule."""
+        return 0
+
+    def samples(self, following: Following) -> tuple[Float64Array, Float64Array, Float64Array]:
+        """Clockwise angles (n,) in degrees, 0 to 360, distances in mm, and the angles by which turns are told apart."""
         n = len(self.distance_mm)
-        span_deg = (next_start_q6 - self.start_q6) / 64 % 360
-        return np.asarray((self.start_q6 / 64 + np.arange(n) * span_deg / n - self.offset_q3 / 8) % 360)
+        span_deg = (following.start_q6 - self.start_q6) / 64 % 360
+        angles_deg = np.asarray((self.start_q6 / 64 + np.arange(n) * span_deg / n - self.offset_q3 / 8) % 360)
+        return angles_deg, self.distance_mm, angles_deg
+
+
+AnyCapsule: TypeAlias = Capsule | UltraCapsule
 
 
 def sample_bytes(sample: Sample) -> bytes:
@@ -180,7 +198,7 @@ def read_sample(data: bytes | bytearray) -> Sample:
 
 
 def is_capsule(data: bytes | bytearray) -> bool:
-    """True when 84 bytes are an intact capsule."""
+    """True when these bytes, as many as a capsule has, are an intact one."""
     if data[0] >> 4 != 0xA or data[1] >> 4 != 0x5:
         return False
     return reduce(xor, data[2:]) == (data[0] & 0xF | (data[1] & 0xF) << 4)
@@ -203,6 +221,9 @@ def read_capsule(data: bytes | bytearray, kind: int, *, signed_offsets: bool = F
     if signed_offsets:
         offsets = np.where(offsets & 0x20, -(offsets & 0x1F), offsets & 0x1F)
     return Capsule(kind, start & 0x7FFF, bool(start >> 15), (words >> 2).reshape(-1).astype(np.float64), offsets)
+
+
+Heard: TypeAlias = Descriptor | Packet | Sample | AnyCapsule | Damage
 
 
 class AnswerDecoder:
@@ -240,9 +261,9 @@ class AnswerDecoder:
         self._expected = self._wanted_kind = None
         return n_bytes
 
-    def receive(self, data: bytes) -> list[Descriptor | Packet | Sample | Capsule | Damage]:
+    def receive(self, data: bytes) -> list[Heard]:
         """Take the next bytes; return what they complete."""
-        found: list[Descriptor | Packet | Sample | Capsule | Damage] = []
+        found: list[Heard] = []
         self._buffer += data
         while True:
             expected = self._expected
@@ -262,7 +283,7 @@ class AnswerDecoder:
         self._skipped_bytes += n_bytes
         self._is_sure = False
 
-    def _accept(self, n_bytes: int, found: list[Descriptor | Packet | Sample | Capsule | Damage]) -> bytes:
+    def _accept(self, n_bytes: int, found: list[Heard]) -> bytes:
         if self._skipped_bytes:
             found.append(Damage(DamageReason.DEBRIS, self._skipped_bytes))
             self._skipped_bytes = 0
@@ -271,7 +292,7 @@ class AnswerDecoder:
         self.accepted_bytes += n_bytes
         return data
 
-    def _find_descriptor(self, found: list[Descriptor | Packet | Sample | Capsule | Damage]) -> bool:
+    def _find_descriptor(self, found: list[Heard]) -> bool:
         at = self._buffer.find(DESCRIPTOR_START)
         if at < 0:
             at = len(self._buffer) - self._buffer.endswith(DESCRIPTOR_START[:1])
@@ -281,7 +302,7 @@ class AnswerDecoder:
             return False
         word, kind = struct.unpack_from("<IB", self._buffer, 2)
         length, many = word & 0x3FFFFFFF, word >> 30
-        fits = (4 < length <= MAX_REPLY_BYTES) if kind == Answer.CONF else _LENGTHS.get(kind) == length
+        fits = (4 < length <= MAX_REPLY_BYTES) if kind == Answer.CONF else LENGTHS.get(kind) == length
         if not fits or many != (kind in STREAMS) or self._wanted_kind not in (None, kind):
             self._skip(1)
             return True
@@ -291,14 +312,14 @@ class AnswerDecoder:
         found.append(self._expected)
         return True
 
-    def _take_packet(self, expected: Descriptor, found: list[Descriptor | Packet | Sample | Capsule | Damage]) -> bool:
+    def _take_packet(self, expected: Descriptor, found: list[Heard]) -> bool:
         if len(self._buffer) < expected.length:
             return False
         found.append(Packet(expected.kind, self._accept(expected.length, found)))
         self._expected = None
         return True
 
-    def _take_sample(self, found: list[Descriptor | Packet | Sample | Capsule | Damage]) -> bool:
+    def _take_sample(self, found: list[Heard]) -> bool:
         wanted = 1 if self._is_sure else SURE_SAMPLES
         buffer = self._buffer
         for k in range(wanted):
@@ -314,14 +335,17 @@ class AnswerDecoder:
         self._is_sure = True
         return True
 
-    def _take_capsule(self, expected: Descriptor, found: list[Descriptor | Packet | Sample | Capsule | Damage]) -> bool:
-        if len(self._buffer) < CAPSULE_BYTES:
+    def _take_capsule(self, expected: Descriptor, found: list[Heard]) -> bool:
+        if len(self._buffer) < expected.length:
             return False
-        if self._buffer[0] >> 4 != 0xA or not is_capsule(self._buffer[:CAPSULE_BYTES]):
+        if self._buffer[0] >> 4 != 0xA or not is_capsule(self._buffer[: expected.length]):
             self._skip(1)
             return True
-        data = self._accept(CAPSULE_BYTES, found)
-        found.append(read_capsule(data, expected.kind, signed_offsets=self._signed_offsets))
+        data = self._accept(expected.length, found)
+        if expected.kind == Answer.ULTRA:
+            found.append(read_ultra(data))
+        else:
+            found.append(read_capsule(data, expected.kind, signed_offsets=self._signed_offsets))
         return True
 
 

@@ -5,14 +5,13 @@ A lidar is asked only for what its firmware is known to have. Its motor is switc
 """
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from drivers.errors import ScannerRefused, ScannerTimeout
-from drivers.protocols.conversation import Conversation
+from drivers.protocols.conversation import Conversation, Listener
 from drivers.protocols.device_clock import DeviceClock
 from drivers.protocols.dialogue import Answer as Awaited
 from drivers.protocols.dialogue import Pause, Quiet, Script
@@ -23,7 +22,7 @@ from drivers.protocols.rplidar import (
     STREAMS,
     Answer,
     AnswerDecoder,
-    Capsule,
+    AnyCapsule,
     Command,
     Conf,
     Descriptor,
@@ -33,8 +32,7 @@ from drivers.protocols.rplidar import (
     request,
 )
 from drivers.protocols.rplidar_turns import Turn, TurnCollector
-from drivers.protocols.scanner_events import ScannerEvent
-from drivers.scanline import DeviceInfo, Profile, SensorGeometry
+from drivers.scanline import DeviceInfo, SensorGeometry
 
 RATES = (115_200, 256_000, 460_800, 1_000_000)
 USUAL_PWM = 660
@@ -98,18 +96,14 @@ class RplidarHost(Conversation):
     silent_after_s = 2.0
 
     def __init__(
-        self,
-        deliver: Callable[[Profile], bool],
-        emit: Callable[[ScannerEvent], None],
-        boot_id: int,
-        rates: tuple[int, ...] = RATES,
-        options: RplidarOptions | None = None,
+        self, listener: Listener, rates: tuple[int, ...] = RATES, options: RplidarOptions | None = None
     ) -> None:
         self._options = options or RplidarOptions()
         self._answers = AnswerDecoder(signed_offsets=self._options.signed_offsets)
-        super().__init__(deliver, emit, self._answers, boot_id=boot_id, rates=rates)
+        super().__init__(listener, self._answers, rates)
         self._turns = TurnCollector()
         self._mode: Mode | None = None
+        self._unread: dict[str, int] = {}  # modes whose answers are not understood, by name
         self._has_pwm = False
         self._turn_s = 1.0 / _USUAL_TURN_HZ
         self._clock = DeviceClock(_COUNTER, 1e-6)
@@ -122,9 +116,9 @@ class RplidarHost(Conversation):
             for item in found:
                 if isinstance(item, Damage):
                     self._turns.lost_bytes(item.n_bytes)
-                elif isinstance(item, Sample | Capsule) and self._dialogue is None:
+                elif isinstance(item, Sample | AnyCapsule) and self._dialogue is None:
                     self._collect(item, now_s)
-        return [item for item in found if not isinstance(item, Sample | Capsule)]
+        return [item for item in found if not isinstance(item, Sample | AnyCapsule)]
 
     def _reset_decoder(self) -> list[Damage]:
         self._turns.forget()
@@ -229,11 +223,13 @@ class RplidarHost(Conversation):
         """One mode; None for one whose packets this driver cannot read, or which the lidar does not describe."""
         kind = yield from self._conf("<B", Conf.ANSWER_TYPE, number)
         us_q8 = yield from self._conf("<I", Conf.US_PER_SAMPLE, number)
-        if kind not in STREAMS or not us_q8:
-            return None
         far_q8 = yield from self._conf("<I", Conf.MAX_DISTANCE, number)
         name = yield from self._packet(conf_request(Conf.NAME, number), Answer.CONF)
         text = (name or b"")[4:].split(b"\0")[0].decode("ascii", "replace") or f"mode {number}"
+        if kind not in STREAMS or not us_q8:
+            if kind is not None:
+                self._unread[text.lower()] = kind
+            return None
         far_mm = far_q8 / 256 * 1000 if far_q8 else _USUAL_RANGE_MM
         return Mode(text, kind, us_q8 / 256, far_mm, None if kind == Answer.STANDARD else number)
 
@@ -252,6 +248,11 @@ class RplidarHost(Conversation):
             if mode.name.lower() == wanted or (wanted == "express" and mode.kind != Answer.STANDARD):
                 return mode
         names = ", ".join(dict.fromkeys(mode.name for mode in modes))
+        if wanted in self._unread:
+            raise ScannerRefused(
+                f"mode {self._options.mode!r} of this lidar sends answers of type {self._unread[wanted]:02X}h, "
+                f"which this driver does not read; choose one of {names}"
+            )
         raise ScannerRefused(f"this lidar has no mode {self._options.mode!r}; its modes are {names}")
 
     def _begin(self) -> Script[None]:
@@ -297,7 +298,7 @@ class RplidarHost(Conversation):
     def _take(self, item: Any, now_s: float) -> None:
         """All that comes while it streams is taken as it is decoded."""
 
-    def _collect(self, item: Sample | Capsule, now_s: float) -> None:
+    def _collect(self, item: Sample | AnyCapsule, now_s: float) -> None:
         """Take a sample or a capsule, and the turn that it ends."""
         turn = self._turns.sample(item) if isinstance(item, Sample) else self._turns.capsule(item)
         if self._turns.implausible > self._told_implausible:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.protocols.rplidar import SAMPLE_BYTES, Capsule, Sample
+from drivers.protocols.rplidar import SAMPLE_BYTES, AnyCapsule, Sample
 from drivers.scanline import BoolArray, Float64Array
 
 _MAX_SAMPLES = 32_768
@@ -69,7 +69,7 @@ class TurnCollector:
         self._open: _Open | None = None
         self._last_deg: float | None = None
         self._doubted = 0
-        self._held: Capsule | None = None
+        self._held: AnyCapsule | None = None
         self._span_deg = 0.0
         self._has_gap = False
 
@@ -102,13 +102,13 @@ class TurnCollector:
             self._open.add(np.array([angle_deg]), np.array([sample.distance_q2 / 4]))
         return self._bounded(ended)
 
-    def capsule(self, capsule: Capsule) -> Turn | None:
+    def capsule(self, capsule: AnyCapsule) -> Turn | None:
         """Take a capsule; return the turn that the one held back ends."""
         held, self._held = self._held, capsule
         had_gap, self._has_gap = self._has_gap, False
         if held is None or capsule.is_first:
             return None
-        n = len(held.distance_mm)
+        n = held.n_samples
         span_deg = (capsule.start_q6 - held.start_q6) / 64 % 360
         if had_gap:
             lost = max(1, round(span_deg / self._span_deg)) if self._span_deg else 1
@@ -117,17 +117,17 @@ class TurnCollector:
             passed_zero = held.start_q6 > capsule.start_q6
             return self._begin_turn() if passed_zero else None
         self._span_deg = span_deg
-        angles_deg = held.angles_deg(capsule.start_q6)
-        before = np.concatenate([[angles_deg[0] if self._last_deg is None else self._last_deg], angles_deg[:-1]])
-        crossing = np.flatnonzero((before > 270) & (angles_deg < 90))
-        self._last_deg = float(angles_deg[-1])
+        angles_deg, distance_mm, turned_deg = held.samples(capsule)
+        before = np.concatenate([[turned_deg[0] if self._last_deg is None else self._last_deg], turned_deg[:-1]])
+        crossing = np.flatnonzero((before > 270) & (turned_deg < 90))
+        self._last_deg = float(turned_deg[-1])
         if not len(crossing):
-            self._add(angles_deg, held.distance_mm)
+            self._add(angles_deg, distance_mm)
             return self._bounded(None)
         at = int(crossing[0])
-        self._add(angles_deg[:at], held.distance_mm[:at])
+        self._add(angles_deg[:at], distance_mm[:at])
         ended = self._begin_turn()
-        self._add(angles_deg[at:], held.distance_mm[at:])
+        self._add(angles_deg[at:], distance_mm[at:])
         return ended
 
     def forget(self) -> None:

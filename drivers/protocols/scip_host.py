@@ -3,22 +3,19 @@
 What it asks for is only what the sensor announced (PP), because old firmware locks up on what it does not know.
 """
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from drivers.errors import ScannerRefused, ScannerSilent, ScannerTimeout
-from drivers.protocols.conversation import Conversation
+from drivers.protocols.conversation import Conversation, Listener
 from drivers.protocols.device_clock import DeviceClock
 from drivers.protocols.dialogue import Answer, Quiet, Script
 from drivers.protocols.framing import Damage, DamageReason
 from drivers.protocols.polar import reasons_of, sensor_from_polar
-from drivers.protocols.scanner_events import ScannerEvent
 from drivers.protocols.scip import (
-    BLOCK_CHARS,
     CLOCK_SPAN,
     CLOCK_TICK_S,
     SCANNING,
@@ -27,132 +24,29 @@ from drivers.protocols.scip import (
     ReplyDecoder,
     Scan,
     info_fields,
-    n_steps,
     scan_of,
     stream_echo,
 )
 from drivers.protocols.scip_echoes import ECHO_STREAMS, NONE, EchoScan, echoes_of
-from drivers.scanline import DeviceInfo, Profile, SensorGeometry
+from drivers.protocols.scip_plan import RATES, Parameters, Request, ScipOptions, parameters_of, request_for
+from drivers.scanline import DeviceInfo, SensorGeometry
 
-RATES = (115_200, 19_200, 38_400, 57_600, 250_000, 500_000, 750_000)
 QUIET_S = 0.14
 """Silence after which a stale stream is taken to have ended; Hokuyo's own client waits as long."""
 _ANSWER_S = 0.4
 _STALE_S = 2.5  # a scan that was under way at 19200 baud takes more than a second to arrive
-_BITS_PER_BYTE = 10
-_MAX_INTERVAL = 9
 _CODES = 32  # no model has more codes; a nearest distance beyond them must not make more reasons
 _WIDTHS = STREAMS | ECHO_STREAMS
-_LINE_SHARE = 0.95  # of the line's time that scans may fill: replies and a slow motor need the rest
-
-
-@dataclass(frozen=True, slots=True)
-class ScipOptions:
-    """What to ask a lidar for.
-
-    Parameters
-    ----------
-    field_of_view_rad : (lowest, highest) angle, 0 ahead, counter-clockwise; None is all the sensor has.
-    command : `MD` distances of three characters, `MS` of two (up to 4,095 mm), `ME` with intensities; of newer models
-        `ND` with several echoes a step, `NE` the same with intensities.
-    echo : which of several echoes counts: `first`, `last`, or the `strongest`, which needs `NE`.
-    cluster : neighbouring steps merged into one value, the smallest distance of them.
-    interval : scans left out between two, 0 to 9; None is as few as the line has time for, and says so.
-    work_rate : baud rate to switch to where the sensor answers at a lower one; None stays.
-    """
-
-    field_of_view_rad: tuple[float, float] | None = None
-    command: str = "MD"
-    cluster: int = 1
-    interval: int | None = None
-    work_rate: int | None = 115_200
-    echo: str = "first"
-
-    def __post_init__(self) -> None:
-        if self.command not in _WIDTHS:
-            raise ValueError(f"a lidar is asked with one of {', '.join(_WIDTHS)}, not {self.command!r}")
-        needed = {"first": tuple(_WIDTHS), "last": ("ND", "NE"), "strongest": ("NE",)}.get(self.echo)
-        if needed is None:
-            raise ValueError(f"echo must be first, last or strongest, not {self.echo!r}")
-        if self.command not in needed:
-            raise ValueError(f"the {self.echo} echo is told with command {' or '.join(needed)}, not {self.command}")
-        if not 1 <= self.cluster <= 99:
-            raise ValueError(f"cluster must be 1 to 99, not {self.cluster}")
-        if self.interval is not None and not 0 <= self.interval <= _MAX_INTERVAL:
-            raise ValueError(f"interval must be 0 to {_MAX_INTERVAL}, not {self.interval}")
-        if self.field_of_view_rad is not None and not self.field_of_view_rad[0] < self.field_of_view_rad[1]:
-            raise ValueError("the field of view must be (lowest, highest) angle")
-        if self.work_rate is not None and self.work_rate not in RATES:
-            raise ValueError(f"SCIP has the rates {', '.join(map(str, sorted(RATES)))}, not {self.work_rate}")
-
-
-@dataclass(frozen=True, slots=True)
-class Parameters:
-    """What PP says: distances in mm, steps of a turn, and the motor's turns a minute."""
-
-    model: str
-    min_mm: int
-    max_mm: int
-    steps_per_turn: int
-    first_step: int
-    last_step: int
-    front_step: int
-    rpm: int
-
-    @property
-    def period_s(self) -> float:
-        """Seconds of one turn."""
-        return 60.0 / self.rpm
-
-    def step_at(self, angle_rad: float) -> int:
-        """The step nearest to an angle, kept within those there are."""
-        step = self.front_step + round(angle_rad * self.steps_per_turn / math.tau)
-        return min(max(step, self.first_step), self.last_step)
-
-
-@dataclass(frozen=True, slots=True)
-class _Request:
-    """The measurement that was asked for."""
-
-    command: str
-    start: int
-    end: int
-    cluster: int
-    interval: int
-
-    @property
-    def text(self) -> str:
-        return f"{self.command}{self.start:04d}{self.end:04d}{self.cluster:02d}{self.interval}00"
-
-    @property
-    def n_values(self) -> int:
-        return n_steps(self.start, self.end, self.cluster)
-
-
-def scan_bytes(command: str, n_values: int) -> int:
-    """Return the bytes of one scan on the wire: echo, status, time, blocks of 64 with sum and end, empty line.
-
-    Of ND and NE with one echo a step; each further one is a character more than the first.
-    """
-    n_chars = n_values * _WIDTHS[command]
-    return 16 + 4 + 6 + n_chars + 2 * -(-n_chars // BLOCK_CHARS) + 1
 
 
 class ScipHost(Conversation):
     """One conversation with one Hokuyo lidar."""
 
-    def __init__(
-        self,
-        deliver: Callable[[Profile], bool],
-        emit: Callable[[ScannerEvent], None],
-        boot_id: int,
-        rates: tuple[int, ...] = RATES,
-        options: ScipOptions | None = None,
-    ) -> None:
-        super().__init__(deliver, emit, ReplyDecoder(), boot_id=boot_id, rates=rates)
+    def __init__(self, listener: Listener, rates: tuple[int, ...] = RATES, options: ScipOptions | None = None) -> None:
+        super().__init__(listener, ReplyDecoder(), rates)
         self._options = options or ScipOptions()
         self._parameters: Parameters | None = None
-        self._request: _Request | None = None
+        self._request: Request | None = None
         self._angles_rad = np.empty(0)
         self._clock = DeviceClock(CLOCK_SPAN, CLOCK_TICK_S)
         self._dropped_lines = 0  # scans that the lidar made and had no time to send
@@ -162,7 +56,7 @@ class ScipHost(Conversation):
     def _greet(self) -> Script[DeviceInfo]:
         yield from self._find_rate(self._quieten)
         version = yield from self._information("VV")
-        parameters = _parameters((yield from self._information("PP")))
+        parameters = parameters_of((yield from self._information("PP")))
         yield from self._switch_rate()
         state = (yield from self._information("II", required=False)).get("STAT", "")
         if state and "well" not in state.lower() and not state.startswith("000"):
@@ -176,7 +70,7 @@ class ScipHost(Conversation):
             firmware=version.get("FIRM", ""),
             calibration_id=version.get("PROD", ""),
             boot_id=self.boot_id,
-            points_per_line=self._plan(parameters).n_values,
+            points_per_line=request_for(self._options, parameters, self.baud_rate).n_values,
             geometry=SensorGeometry(np.zeros(3), np.zeros(3), reach_mm, 0.0),
         )
 
@@ -243,13 +137,11 @@ class ScipHost(Conversation):
 
     def _begin(self) -> Script[None]:
         assert self._parameters is not None
-        request = self._plan(self._parameters)
+        request = request_for(self._options, self._parameters, self.baud_rate)
         self._check_bandwidth(request, self._parameters)
         self._request = request
-        first = request.start + (request.cluster - 1) / 2
-        steps = first + request.cluster * np.arange(request.n_values)
-        self._angles_rad = (steps - self._parameters.front_step) * math.tau / self._parameters.steps_per_turn
-        self.silent_after_s = max(2.0, 5 * self._period_s(request, self._parameters))
+        self._angles_rad = request.angles_rad(self._parameters)
+        self.silent_after_s = max(2.0, 5 * request.period_s(self._parameters))
         for _ in range(2):
             self._say(request.text.encode() + b"\n")
             self.laser_on = None
@@ -293,7 +185,7 @@ class ScipHost(Conversation):
             return
         device_time_s = self._clock.read(scan.timestamp, now_s)
         self._jumped(self._clock.jumps)
-        self._dropped_lines += self._account.lost_by_time(device_time_s, self._period_s(request, parameters))
+        self._dropped_lines += self._account.lost_by_time(device_time_s, request.period_s(parameters))
         if not self._account.enter(self._dropped_lines):
             return
         if scan.damaged_bytes:
@@ -308,7 +200,7 @@ class ScipHost(Conversation):
         x_mm, z_mm = sensor_from_polar(range_mm, self._angles_rad)
         self._profile(x_mm, z_mm, missing.copy(), device_time_s, now_s, counts)
 
-    def _read(self, answer: Reply, request: _Request) -> Scan | None:
+    def _read(self, answer: Reply, request: Request) -> Scan | None:
         """The scan in a reply, a distance a step."""
         width = _WIDTHS[request.command]
         if request.command in ECHO_STREAMS:
@@ -325,23 +217,8 @@ class ScipHost(Conversation):
         else:
             self._advise(f"the lidar says {_meaning(status)}")
 
-    def _plan(self, parameters: Parameters) -> _Request:
-        """The measurement to ask for; where the interval is free, the smallest that the line has time for."""
-        options = self._options
-        start, end = parameters.first_step, parameters.last_step
-        if options.field_of_view_rad is not None:
-            start, end = (parameters.step_at(angle) for angle in options.field_of_view_rad)
-        request = _Request(options.command, start, end, options.cluster, options.interval or 0)
-        if options.interval is not None:
-            return request
-        for interval in range(_MAX_INTERVAL + 1):
-            request = _Request(options.command, start, end, options.cluster, interval)
-            if self._wire_s(request) <= self._period_s(request, parameters) * _LINE_SHARE:
-                break
-        return request
-
-    def _check_bandwidth(self, request: _Request, parameters: Parameters) -> None:
-        wire_s, period_s = self._wire_s(request), self._period_s(request, parameters)
+    def _check_bandwidth(self, request: Request, parameters: Parameters) -> None:
+        wire_s, period_s = request.wire_s(self.baud_rate), request.period_s(parameters)
         remedy = "use a higher rate, MS instead of MD, a larger cluster, a smaller field of view or a larger interval"
         if wire_s > period_s:
             raise ScannerRefused(
@@ -353,13 +230,6 @@ class ScipHost(Conversation):
                 f"{request.interval} of {request.interval + 1} scans are left out: at {self.baud_rate} baud one takes "
                 f"{wire_s:.3g} s on the line; {remedy.replace('a larger interval', 'fewer points')}"
             )
-
-    def _wire_s(self, request: _Request) -> float:
-        return scan_bytes(request.command, request.n_values) * _BITS_PER_BYTE / self.baud_rate
-
-    @staticmethod
-    def _period_s(request: _Request, parameters: Parameters) -> float:
-        return parameters.period_s * (request.interval + 1)
 
 
 def _one_echo(told: EchoScan, which: str) -> Scan:
@@ -375,20 +245,6 @@ def _one_echo(told: EchoScan, which: str) -> Scan:
 
 def _is_reply_to(command: str) -> Callable[[Any], bool]:
     return lambda item: isinstance(item, Reply) and item.echo == command
-
-
-def _parameters(fields: dict[str, str]) -> Parameters:
-    """The parameters in an answer to PP; raises ScannerRefused when they cannot be a lidar's."""
-    try:
-        numbers = [int(fields[key]) for key in ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")]
-    except (KeyError, ValueError) as error:
-        raise ScannerRefused(f"the lidar's parameters (PP) cannot be read: {error}") from error
-    low, high, turn, first, last, front, rpm = numbers
-    if not (
-        0 < low < high < 1 << 18 and 0 <= first <= front <= last <= 9999 and last - first < turn and 0 < rpm < 60_000
-    ):
-        raise ScannerRefused(f"the lidar's parameters (PP) contradict each other: {fields}")
-    return Parameters(fields.get("MODL", "Hokuyo lidar"), low, high, turn, first, last, front, rpm)
 
 
 def _meaning(status: str) -> str:

@@ -97,6 +97,7 @@ class StageHost(ABC):
         self._tolerance = tolerance
         self._heard_s = self._opened_s = 0.0
         self._quiet_s = self._ticked_s = 0.0
+        self._listening_s = 0.0  # all the time in which this program has listened
         self._lost_s: float | None = None
         self._interrupted: Kind | None = None  # what the stop under way ended
 
@@ -134,6 +135,7 @@ class StageHost(ABC):
         # A program that was held up for a while has not listened: only time in which it did counts as silence, and an
         # errand has as much more time.
         counts_s = listened_s(self._ticked_s, now_s)
+        self._listening_s += counts_s
         self._quiet_s += counts_s
         errand = self.errand
         if errand is not None:

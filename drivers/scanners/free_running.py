@@ -13,14 +13,13 @@ from typing import Self, TypeAlias
 from drivers.errors import DriverError, PortError, ScannerNotConnected, ScannerSilent, ScannerTimeout
 from drivers.patience import wait_patiently
 from drivers.port import LEAVE_LINES, ModemLines
-from drivers.protocols.conversation import Conversation, Phase, Task
-from drivers.protocols.scanner_events import ScannerEvent
-from drivers.scanline import DeviceInfo, Profile
+from drivers.protocols.conversation import Conversation, Listener, Phase, Task
+from drivers.scanline import DeviceInfo
 from drivers.scanners.face import Happening
 from drivers.scanners.link import Inbox, Link, Wire
 from drivers.tally import Tally
 
-MakeConversation: TypeAlias = Callable[[Callable[[Profile], bool], Callable[[ScannerEvent], None], int], Conversation]
+MakeConversation: TypeAlias = Callable[[Listener], Conversation]
 
 _ENTER_S = 30.0
 _COMMAND_S = 15.0
@@ -34,7 +33,7 @@ class FreeRunner:
     ----------
     port_path : the tty, an absolute path. Links are followed anew at each opening; where /dev/serial/by-id has a link
         to the same adapter, a lost port is looked for by that, since its number may have changed.
-    converse : makes the conversation, of a place for profiles, one for events, and a boot id.
+    converse : makes the conversation, of whoever listens to it.
     lines : how the modem lines are to stand.
     clock : seconds that never run backwards; it stamps the arrival of profiles.
     queue_lines : profiles that may wait to be fetched by `events`; more are lost and counted as `host_overflow`.
@@ -79,7 +78,7 @@ class FreeRunner:
         if self._link is not None:
             raise DriverError(f"{self._path} has been entered already; exit first")
         self._inbox = Inbox(self._queue_lines)
-        self._host = host = self._converse(self._inbox.deliver, self._inbox.tell, secrets.randbits(32))
+        self._host = host = self._converse(Listener(self._inbox.deliver, self._inbox.tell, secrets.randbits(32)))
         self._link = link = Link(
             self._path, host, self._changed, self._clock, lambda: Wire(host.baud_rate, host.dtr), self._lines
         )

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 from drivers.errors import DriverError, DriverUnknown, PortError, ScannerError
 from drivers.plugins import SCANNERS_GROUP, added, find_added
-from drivers.protocols import lms_host, ls100_host, rplidar_host, scip_host
+from drivers.protocols import lms_host, ls100_host, rplidar_host, scip_plan
 from drivers.scanline import DeviceInfo
 from drivers.scanners.face import FreeRunningScanner, Scanner
 from drivers.scanners.lms import open_lms
@@ -59,11 +59,11 @@ KNOWN: dict[str, KnownScanner] = {
         KnownScanner(
             "scip",
             "Hokuyo lidar, SCIP 2.0 (URG, UBG, UHG, UTM)",
-            scip_host.RATES,
+            scip_plan.RATES,
             open_scip,
             True,
             True,
-            scip_host.ScipOptions,
+            scip_plan.ScipOptions,
         ),
         KnownScanner(
             "rplidar",

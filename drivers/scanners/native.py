@@ -149,9 +149,9 @@ class NativeScanner:
     def most_lines_per_s(self) -> float:
         """Lines a second for which the wire has time at its baud rate; infinite before the scanner is entered."""
         with self._changed:
-            info = self._host.info
+            stream = self._host.stream
         bytes_per_s = self._baud_rate / _BITS_PER_BYTE
-        return math.inf if info is None else bytes_per_s / line_bytes(info.points_per_line)
+        return math.inf if stream is None else bytes_per_s / line_bytes(stream.info.points_per_line)
 
     def stop_pass(self) -> None:
         """Stop the pass and switch the laser off; returns when its last lines and `PassEnded` are in `events`.

@@ -2,7 +2,8 @@
 
 from functools import partial
 
-from drivers.protocols.scip_host import RATES, ScipHost, ScipOptions
+from drivers.protocols.scip_host import ScipHost
+from drivers.protocols.scip_plan import RATES, ScipOptions
 from drivers.scanners.free_running import FreeRunner
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from drivers.protocols.rplidar import (
     DENSE_SAMPLES,
     EXPRESS_SAMPLES,
+    LENGTHS,
     Answer,
     Capsule,
     Command,
@@ -23,6 +24,7 @@ from drivers.protocols.rplidar import (
     descriptor,
     sample_bytes,
 )
+from drivers.protocols.rplidar_ultra import ULTRA_SAMPLES, look_aside_deg, ultra_bytes
 from drivers.scanline import Float64Array
 from simulators.sweep import RangeScene
 
@@ -31,6 +33,7 @@ _BANNER = b"RP LIDAR System.\r\nFirmware Ver 1.29, HW Ver 7\r\nModel: simulated\
 _BOOT_S = 0.5
 _QUALITY = 47
 _SAMPLES_AT_ONCE = 4_000
+_ROUNDS, _AGREE_MM = 8, 0.5
 _OFFSETS_Q3 = np.array([0, 3, 1, 2])  # by turns; only that they are not all zero matters
 
 
@@ -72,6 +75,15 @@ A2 = Model(
     5,
     256_000,
     (ScanMode("Standard", Answer.STANDARD, 250.0, 12.0), ScanMode("Express", Answer.EXPRESS, 125.0, 12.0)),
+    1,
+    True,
+)
+A3 = Model(
+    49,
+    (1, 26),
+    7,
+    256_000,
+    (ScanMode("Standard", Answer.STANDARD, 250.0, 12.0), ScanMode("Sensitivity", Answer.ULTRA, 62.5, 25.0)),
     1,
     True,
 )
@@ -192,7 +204,7 @@ class RplidarDevice:
                 # number 0 is the legacy express scan, whatever the list of modes says
                 wanted = modes.get(Answer.EXPRESS, numbered) if payload[0] == 0 else numbered
                 if wanted is not None:
-                    self._start(wanted, 84 if wanted.kind != Answer.STANDARD else 5, now_s)
+                    self._start(wanted, LENGTHS[Answer(wanted.kind)], now_s)
 
     def _answer(self, kind: int, data: bytes) -> None:
         self._out += descriptor(kind, len(data), many=False) + data
@@ -204,6 +216,8 @@ class RplidarDevice:
         number = int.from_bytes(payload[4:6], "little")
         mode = self.model.modes[number] if number < len(self.model.modes) else None
         match what:
+            case Conf.DESIRED_TURNS:
+                value = struct.pack("<HH", round(self._turn_hz * 60), 660)
             case Conf.MODE_COUNT:
                 value = struct.pack("<H", len(self.model.modes))
             case Conf.TYPICAL_MODE:
@@ -232,7 +246,7 @@ class RplidarDevice:
     @property
     def _batch(self) -> int:
         """Samples of one packet."""
-        kinds = {Answer.EXPRESS: EXPRESS_SAMPLES, Answer.DENSE: DENSE_SAMPLES}
+        kinds = {Answer.EXPRESS: EXPRESS_SAMPLES, Answer.DENSE: DENSE_SAMPLES, Answer.ULTRA: ULTRA_SAMPLES}
         return 1 if self._mode is None else kinds.get(Answer(self._mode.kind), 1)
 
     def _due_s(self, sample: int) -> float:
@@ -253,6 +267,9 @@ class RplidarDevice:
         turns: Float64Array = numbers * mode.us_per_sample * 1e-6 * self._turn_hz
         if mode.kind == Answer.STANDARD:
             self._send_samples(turns)
+        elif mode.kind == Answer.ULTRA:
+            for at in range(0, n, self._batch):
+                self._send_ultra(turns[at : at + self._batch])
         else:
             for at in range(0, n, self._batch):
                 self._send_capsule(turns[at : at + self._batch], mode)
@@ -284,6 +301,22 @@ class RplidarDevice:
         capsule = Capsule(mode.kind, start_q6, self._is_first, np.minimum(np.rint(ranges), limit), offsets)
         self._is_first = False
         self._send(capsule_bytes(capsule), n)
+
+    def _send_ultra(self, turns: Float64Array) -> None:
+        """The beam leaves beside the axis: where it looks depends on how far it gets, which a few rounds find.
+
+        At the edges of what it sees they may find nothing that agrees with itself: then nothing comes back.
+        """
+        step = turns[1] - turns[0]
+        places = np.append(turns, turns[-1] + step)  # the first sample of the next capsule, too
+        ranges = np.zeros(len(places))
+        before = ranges
+        for _ in range(_ROUNDS):
+            before, ranges = ranges, np.nan_to_num(self._ranges(places - look_aside_deg(ranges) / 360))
+        ranges = np.where(np.abs(ranges - before) < _AGREE_MM, ranges, 0.0)
+        start_q6 = math.floor(float(turns[0]) % 1.0 * 360 * 64)
+        self._send(ultra_bytes(start_q6, ranges[:-1], float(ranges[-1]), is_first=self._is_first), len(turns))
+        self._is_first = False
 
     def _send(self, packet: bytes, n_samples: int) -> None:
         if len(self._out) + len(packet) > _BUFFER_BYTES:

@@ -13,45 +13,21 @@ import numpy as np
 from drivers.protocols.scip import (
     CLOCK_SPAN,
     SCANNING,
-    SINGLES,
     STREAMS,
-    IntArray,
     checked,
     data_lines,
     encode_value,
     info_lines,
     reply,
 )
-from drivers.protocols.scip_echoes import ECHO_SINGLES, ECHO_STREAMS, echo_characters
-from drivers.scanline import Float64Array
+from drivers.protocols.scip_echoes import ECHO_STREAMS
+from simulators.devices.scip_scans import URG_04LX, Model, scan_characters
 from simulators.sweep import RangeScene
 
 _RATES = (19_200, 38_400, 57_600, 115_200, 250_000, 500_000, 750_000)
 _MAX_REQUEST = 64
 _MEASURE = re.compile(r"(M[DSE]|N[DE]|G[DSE]|H[DE])(\d{4})(\d{4})(\d{2})(?:(\d)(\d{2}))?")
 _TAG = re.compile(r"[A-Za-z0-9 ._+@]{0,16}")
-
-
-@dataclass(frozen=True, slots=True)
-class Model:
-    """What a type of lidar says in PP; a turn is `steps_per_turn` steps, `front` looks ahead."""
-
-    name: str
-    min_mm: int
-    max_mm: int
-    steps_per_turn: int
-    first: int
-    last: int
-    front: int
-    rpm: int
-    tells_echoes: bool = False
-
-
-URG_04LX = Model("URG-04LX(Hokuyo Automatic Co.,Ltd.)", 20, 5600, 1024, 44, 725, 384, 600)
-UTM_30LX = Model("UTM-30LX[Serial No]", 23, 60_000, 1440, 0, 1080, 540, 2400)
-UTM_30LX_EW = Model("UTM-30LX-EW", 23, 60_000, 1440, 0, 1080, 540, 2400, tells_echoes=True)
-_FIRST_LIGHT, _FURTHER_LIGHT = 1000, 2500
-"""Intensities: what the beam goes through gives back less than what it ends on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -366,43 +342,12 @@ class ScipDevice:
             self._switch_laser(False)
 
     def _scan(self, command: str, start: int, end: int, cluster: int, at_s: float) -> bytes:
-        model = self.model
         if self._measuring_since_s is None:
             self._measuring_since_s = at_s
-        steps = np.arange(start, end + 1)
-        angles = ((steps - model.front) * (2 * np.pi / model.steps_per_turn)).astype(np.float64)
-        elapsed_s = at_s - self._measuring_since_s
-        values = self._nearest(self._scene(angles, elapsed_s), cluster)
-        echo_width = (ECHO_STREAMS | ECHO_SINGLES).get(command)
-        if echo_width is not None:
-            further = np.zeros_like(values)
-            if self._behind is not None:
-                further = self._nearest(self._behind(angles, elapsed_s), cluster)
-            lights = (_FIRST_LIGHT, _FURTHER_LIGHT)
-            echoes = [
-                [(mm, light)[: echo_width // 3] for mm, light in zip(step, lights, strict=True) if mm] or [(0, 0)]
-                for step in np.stack([values, further], axis=1).tolist()
-            ]
-            return data_lines(
-                self._clock(at_s), echo_characters([[echo[: echo_width // 3] for echo in step] for step in echoes])
-            )
-        width = (STREAMS | SINGLES)[command]
-        if width == 2:
-            values = np.where(values < 1 << 12, values, 0)
-        if width == 6:
-            characters = b"".join(encode_value(value, 3) + encode_value(1000 if value else 0, 3) for value in values)
-        else:
-            characters = b"".join(encode_value(int(value), width) for value in values)
-        return data_lines(self._clock(at_s), characters)
-
-    def _nearest(self, ranges_mm: Float64Array, cluster: int) -> IntArray:
-        """The smallest distance of each cluster in whole mm, 0 where there is none."""
-        rounded = np.rint(ranges_mm)
-        valid = (rounded >= self.model.min_mm) & (rounded <= self.model.max_mm)
-        padded = np.full(-(-len(rounded) // cluster) * cluster, np.inf)
-        padded[: len(rounded)] = np.where(valid, rounded, np.inf)
-        nearest = padded.reshape(-1, cluster).min(axis=1)
-        return np.where(np.isfinite(nearest), nearest, 0).astype(np.int64)
+        angles, elapsed_s = self.model.angles_rad(start, end), at_s - self._measuring_since_s
+        behind = np.full(len(angles), np.nan) if self._behind is None else self._behind(angles, elapsed_s)
+        ranges = self._scene(angles, elapsed_s)
+        return data_lines(self._clock(at_s), scan_characters(self.model, command, cluster, ranges, behind))
 
     def _switch_laser(self, on: bool) -> None:
         if on and not self.laser_on:

@@ -1,7 +1,7 @@
 """The driver against a simulated device behind a real pseudo-terminal: nothing lost unsaid, nothing left behind."""
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,17 +14,16 @@ from drivers.protocols.scanner_events import (
     PassResumed,
     Rebooted,
     Reconnected,
-    ScannerEvent,
 )
 from drivers.scanline import DeviceInfo, Profile, SensorGeometry
 from drivers.scanners.native import NativeScanner
 from simulators.devices.native import NativeDevice
 from simulators.faults import Faults
 from simulators.pty_port import PtyPort
+from tests.end_to_end.catch import Catch, nothing_left
 
 BAUD = 4_000_000
 N_POINTS = 120
-PATIENCE_S = 20.0
 
 
 def scene(stage_mm: float) -> tuple[np.ndarray, np.ndarray]:
@@ -51,46 +50,10 @@ def new_device(dead_man_s: float = 5.0) -> RebootingDevice:
     return RebootingDevice(info, scene, rng=np.random.default_rng(3), buffer_bytes=4_000_000, dead_man_s=dead_man_s)
 
 
-def open_descriptors() -> int:
-    return len(list(Path("/proc/self/fd").iterdir())) if Path("/proc/self/fd").exists() else 0
-
-
 @pytest.fixture(autouse=True)
-def nothing_left_behind() -> Iterator[None]:
-    """No thread and no descriptor survives a test."""
-    threads, descriptors = set(threading.enumerate()), open_descriptors()
-    yield
-    assert set(threading.enumerate()) <= threads
-    assert open_descriptors() == descriptors
-
-
-class Catch:
-    """What has come from a scanner so far, lines and events apart."""
-
-    def __init__(self, scanner: NativeScanner) -> None:
-        self.lines: list[Profile] = []
-        self.told: list[ScannerEvent] = []
-        self._scanner = scanner
-
-    def until(self, enough: Callable[[], bool]) -> None:
-        """Fetch until enough has come; the patience is for a machine under load, not a measurement."""
-        deadline = threading.Event()
-        timer = threading.Timer(PATIENCE_S, deadline.set)
-        timer.start()
-        try:
-            while not enough():
-                assert not deadline.is_set(), (self.told, len(self.lines), self._scanner.tally())
-                for item in self._scanner.events(0.05):
-                    if isinstance(item, Profile):
-                        self.lines.append(item)
-                    else:
-                        self.told.append(item)
-        finally:
-            timer.cancel()
-            timer.join()
-
-    def count(self, kind: type) -> int:
-        return sum(isinstance(event, kind) for event in self.told)
+def leaves_nothing_behind() -> Iterator[None]:
+    with nothing_left():
+        yield
 
 
 def test_a_whole_pass_arrives_exactly_and_the_accounts_balance() -> None:
@@ -141,7 +104,7 @@ def test_a_full_queue_loses_lines_and_says_so_while_the_reader_goes_on() -> None
     with PtyPort(device, BAUD) as port, NativeScanner(str(port.path), BAUD, queue_lines=10) as scanner:
         scanner.start_pass(0.1, 0.0, 10.0, 500.0)
         done = threading.Event()
-        for _ in range(400):
+        for _ in range(1_200):
             lines_so_far = scanner.tally().lines
             if lines_so_far.sent == 101 and lines_so_far.open == 0:
                 break

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from simulators.devices.rplidar import A1, RplidarDevice
-from simulators.devices.scip import URG_04LX, ScipDevice
+from simulators.devices.rplidar import A1, A3, S1, Model, RplidarDevice
+from simulators.devices.scip import ScipDevice
+from simulators.devices.scip_scans import URG_04LX
 from simulators.pty_port import PtyPort
 
 CLIENTS = Path(__file__).parent / "clients"
@@ -135,4 +136,35 @@ def test_rplidar_roboticia_reads_the_simulated_lidar() -> None:
     late_deg = 254e-6 * 10 * 360  # this client counts the samples of a capsule from 1, the manufacturer's from 0
     check_samples([[new, angle - late_deg, distance] for new, angle, distance in found["express"]], 8.0)
     assert 6 <= sum(sample[0] for sample in found["normal"]) <= 9
+    assert not device.laser_on
+
+
+@needs("pyrplidarsdk")
+@pytest.mark.parametrize("model", [A1, A3, S1], ids=["express", "ultra", "dense"])
+def test_the_manufacturers_own_sdk_reads_the_simulated_lidar(model: Model) -> None:
+    def two_walls(angles_rad: np.ndarray, _elapsed_s: float) -> np.ndarray:
+        """One 800 mm ahead, 1.5 m beyond half a radian to the right; nothing else, so that left and right differ."""
+        seen = np.where(angles_rad < -0.5, 1500.0, 800.0) / np.cos(angles_rad)
+        return np.where((angles_rad > -1.0) & (angles_rad < 0.3), seen, np.nan)
+
+    device = RplidarDevice(two_walls, model)
+    device.motor_pwm = 660  # the wrapper of the SDK leaves the motor to others
+    with PtyPort(device, model.baud_rate) as port:
+        found = ask("ask_slamtec_sdk.py", port.path, model.baud_rate, 3)
+    major, minor = model.firmware
+    assert found["info"][:3] == [model.number, major << 8 | minor, model.hardware]
+    assert found["info"][3] == bytes(range(0x10, 0x20)).hex()
+    assert found["health"][1] == 0
+    assert found["scans"]
+    samples_a_turn = 1e6 / model.modes[model.typical].us_per_sample / 10.0
+    for angles, ranges, _ in found["scans"]:
+        ahead = -((np.array(angles) + np.pi) % (2 * np.pi) - np.pi)
+        depth_mm = np.array(ranges) * 1000.0 * np.cos(ahead)
+        assert len(ahead) == pytest.approx(samples_a_turn * 1.3 / (2 * np.pi), rel=0.08)
+        near = (ahead > -0.47) & (ahead < 0.28)
+        far = (ahead > -0.98) & (ahead < -0.53)
+        np.testing.assert_allclose(depth_mm[near], 800.0, atol=2.5)  # steps of 2 mm, angles of 1/64 degree
+        np.testing.assert_allclose(depth_mm[far], 1500.0, atol=4.5)
+        assert near.sum() > 10
+        assert far.sum() > 10
     assert not device.laser_on

@@ -14,8 +14,8 @@ from drivers.scanline import DeviceInfo, SensorGeometry
 from drivers.scanners.native import NativeScanner
 from simulators.devices.native import NativeDevice
 from simulators.pty_port import PtyPort
+from tests.end_to_end.catch import open_descriptors
 from tests.end_to_end.stages import BAUD, KINDS, new_device, open_stage
-from tests.end_to_end.test_driver_on_pty import open_descriptors
 
 PATIENCE_S = 90.0
 

@@ -1,7 +1,6 @@
 """Drivers of other makers' scanners against simulated devices on a real pseudo-terminal, with true rates and cables."""
 
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,17 +8,14 @@ import pytest
 
 from drivers.errors import PortBusy, ScannerNotConnected, ScannerSilent
 from drivers.protocols.scanner_events import Disconnected, PassEnded, Reconnected
-from drivers.scanline import Profile
-from drivers.scanners.free_running import FreeRunner
 from drivers.scanners.known import KNOWN, identify, open_free_running
 from simulators.devices.lms import LmsDevice
 from simulators.devices.rplidar import A2, RplidarDevice
 from simulators.devices.scip import ScipDevice
 from simulators.pty_port import PtyPort
-from tests.end_to_end.test_driver_on_pty import open_descriptors
+from tests.end_to_end.catch import Catch, nothing_left
 from tests.unit.drivers.conversation_bench import flat_scene
 
-PATIENCE_S = 40.0
 DEVICES = {
     "scip": lambda: ScipDevice(flat_scene()),
     "lms200": lambda: LmsDevice(flat_scene(), rng=np.random.default_rng(2)),
@@ -28,37 +24,9 @@ DEVICES = {
 
 
 @pytest.fixture(autouse=True)
-def nothing_left_behind() -> Iterator[None]:
-    """No thread and no descriptor survives a test."""
-    threads, descriptors = set(threading.enumerate()), open_descriptors()
-    yield
-    assert set(threading.enumerate()) <= threads
-    assert open_descriptors() == descriptors
-
-
-class Catch:
-    """What has come from a scanner so far, profiles and events apart."""
-
-    def __init__(self, scanner: FreeRunner) -> None:
-        self.lines: list[Profile] = []
-        self.told: list[object] = []
-        self._scanner = scanner
-
-    def until(self, enough: Callable[[], bool]) -> None:
-        deadline = threading.Event()
-        timer = threading.Timer(PATIENCE_S, deadline.set)
-        timer.start()
-        try:
-            while not enough():
-                assert not deadline.is_set(), (self.told, len(self.lines), self._scanner.tally())
-                for item in self._scanner.events(0.05):
-                    (self.lines if isinstance(item, Profile) else self.told).append(item)
-        finally:
-            timer.cancel()
-            timer.join()
-
-    def count(self, kind: type) -> int:
-        return sum(isinstance(event, kind) for event in self.told)
+def leaves_nothing_behind() -> Iterator[None]:
+    with nothing_left():
+        yield
 
 
 def plugged(name: str, **options: object) -> PtyPort:

@@ -15,7 +15,9 @@ from drivers.protocols.framing import Damage
 from drivers.protocols.lms_host import LmsHost
 from drivers.protocols.ls100_host import Ls100Host
 from drivers.protocols.rplidar_host import RplidarHost
-from drivers.protocols.scip_host import ScipHost, ScipOptions
+from drivers.protocols.rplidar_ultra import UltraCapsule
+from drivers.protocols.scip_host import ScipHost
+from drivers.protocols.scip_plan import ScipOptions
 from simulators.devices.lms import LmsDevice
 from simulators.devices.ls100 import Ls100Device
 from simulators.devices.rplidar import RplidarDevice
@@ -111,6 +113,9 @@ PARSERS: dict[str, Target] = {
     ),
     "rplidar_capsules": parser(
         partial(in_stream, rplidar_vectors.EXPRESS_DESCRIPTOR), rplidar_vectors.CAPSULE * 3, has(rplidar.Capsule), 520
+    ),
+    "rplidar_ultra": parser(
+        partial(in_stream, rplidar_vectors.ULTRA_DESCRIPTOR), rplidar_vectors.ULTRA * 3, has(UltraCapsule), 520
     ),
 }
 

@@ -27,3 +27,7 @@ CAPSULE = bytes.fromhex(
     "15 bc 0f 5e 1f 15 c0 0f 62 1f 15 c4 0f 66 1f 15 c8 0f 6a 1f 15 cc 0f 6e 1f 15 d0 0f 72 1f 15 d4 0f 76 1f 15 d8 0f"
     "7a 1f 15 dc 0f 7e 1f 15"
 )
+
+ULTRA_DESCRIPTOR = bytes.fromhex("a5 5a 84 00 00 40 84")
+ULTRA = bytes.fromhex("a2 52 40 81 90 32 40 01") + bytes(124)
+"""Starts at 5 degrees; its first cabin is 290h (800 mm) and the steps 3 and 5: 290h + 3000h + 1400000h. Check 22h."""

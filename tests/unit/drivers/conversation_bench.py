@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drivers.protocols.conversation import Conversation, Phase, Task
+from drivers.protocols.conversation import Conversation, Listener, Phase, Task
 from drivers.scanline import Float64Array, Profile
 from simulators.faults import misread
 from simulators.pacing import Pacer
@@ -28,7 +28,7 @@ class ConversationBench:
         self.lines: list[Profile] = []
         self.told = []
         self.keeps = True
-        self.host: Conversation = make(self._deliver, self.told.append, 4711)
+        self.host: Conversation = make(Listener(self._deliver, self.told.append, 4711))
         self.device = device
         self.now_s = 100.0
         self.plugged = False

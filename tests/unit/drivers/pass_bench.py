@@ -147,6 +147,10 @@ class BenchScanner:
     def exit(self):
         self.laser_on = False
 
+    def miss(self, n_lines):
+        """Make so many lines that never arrive."""
+        self._line += n_lines
+
     def unplug(self):
         self.is_connected = False
         self._events.append(Disconnected("unplugged", self.shop.now_s))

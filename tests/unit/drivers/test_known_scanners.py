@@ -10,7 +10,7 @@ from drivers.errors import DriverError
 from drivers.protocols.lms_host import LmsOptions
 from drivers.protocols.ls100_host import Ls100Options
 from drivers.protocols.rplidar_host import RplidarOptions
-from drivers.protocols.scip_host import ScipOptions
+from drivers.protocols.scip_plan import ScipOptions
 from drivers.scanners.free_running import FreeRunner
 from drivers.scanners.known import KNOWN, known_scanner, open_free_running, open_scanner
 from drivers.scanners.native import NativeScanner

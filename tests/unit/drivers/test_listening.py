@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 
 from drivers.protocols.listening import LISTENED_S, listened_s
 from drivers.protocols.scanner_events import Disconnected, PassEnded
-from drivers.protocols.scip_host import ScipHost, ScipOptions
+from drivers.protocols.scip_host import ScipHost
+from drivers.protocols.scip_plan import ScipOptions
+from drivers.protocols.stage_events import PositionLost
+from drivers.protocols.stage_host import Phase
 from simulators.devices.scip import ScipDevice
 from tests.unit.drivers.conversation_bench import ConversationBench, flat_scene
 from tests.unit.drivers.stage_bench import KINDS, StageBench
@@ -105,3 +108,18 @@ def test_a_question_is_waited_for_as_long_as_it_could_be_heard() -> None:
     lidar.ask(task)
     lidar.scan(2)
     assert lidar.told == []
+
+
+@pytest.mark.parametrize("looks", [1, 2, 3, 5, 10, 30])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_stage_that_is_met_again_while_the_program_is_held_up_keeps_its_position(kind: str, looks: int) -> None:
+    bench = StageBench(kind).homed()
+    bench.unplug()
+    bench.run(0.3)
+    bench.plug()
+    bench.run(looks * 0.01)
+    bench.now_s += PAUSE_S
+    bench.host.tick(bench.now_s)  # it had read before the pause; what came meanwhile is read next
+    bench.until(lambda: bench.host.phase is Phase.UP, 30.0)
+    assert bench.host.position_known
+    assert not [event for event in bench.told if isinstance(event, PositionLost)]

@@ -139,6 +139,22 @@ def test_counted_lines_keep_their_places_where_others_are_missing(skipped):
     assert not [event for event in told if isinstance(event, Advice)]
 
 
+@pytest.mark.parametrize(("speed", "is_told"), [(10.0, False), (9.0, False), (2.0, True), (20.0, True)])
+@pytest.mark.parametrize("held_up_at", [None, 12, 20])
+def test_a_count_that_does_not_match_is_told_and_a_pause_of_the_program_is_no_mismatch(speed, is_told, held_up_at):
+    shop, _, scanner, drive = bench(PassOrder(0.0, 10.0, 0.5, speed), PairBy.COUNT)
+
+    def hold_up():  # the stage goes on, the scanner too, and what it says is lost
+        shop.now_s += 600 * 0.05
+        scanner.miss(600)
+
+    if held_up_at is not None and not is_told:
+        shop.at_look[held_up_at] = hold_up
+    MotionPass(drive, scanner).run()
+    told = [event.text for event in drive.told.take(0.0) if isinstance(event, Advice)]
+    assert any("lines and places do not match" in text for text in told) is is_told
+
+
 def on_a_conveyor(spacing_mm, by=PairBy.TIME):
     """A pass of 20 lines a second over a conveyor of 10 mm/s: lines come half a millimetre apart."""
     shop, _, scanner, drive = bench(PassOrder(0.0, 10.0, spacing_mm), by)

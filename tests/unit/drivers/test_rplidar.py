@@ -1,5 +1,7 @@
 """The RPLIDAR's bytes: requests, descriptors, samples, capsules; whole, byte by byte and with noise around."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -27,6 +29,7 @@ from drivers.protocols.rplidar import (
     sample_bytes,
 )
 from drivers.protocols.rplidar_turns import Turn, TurnCollector
+from drivers.protocols.rplidar_ultra import coded, decoded, read_ultra, ultra_bytes
 from tests.vectors import rplidar as vectors
 
 SINGLE = {
@@ -84,10 +87,58 @@ def test_a_capsule_is_read_and_written_and_its_angles_follow_from_the_next() -> 
     signed = read_capsule(vectors.CAPSULE, Answer.EXPRESS, signed_offsets=True)
     assert signed.offset_q3.tolist() == [5, -1] * 16
     assert capsule_bytes(capsule) == vectors.CAPSULE
-    angles = capsule.angles_deg(13 * 64)  # 8 degrees on: a quarter of a degree a sample
+    angles, distances, _ = capsule.samples(replace(capsule, start_q6=13 * 64))  # a quarter of a degree a sample
+    np.testing.assert_array_equal(distances, capsule.distance_mm)
     np.testing.assert_allclose(angles, 5 + np.arange(32) / 4 - np.tile([5, 33], 16) / 8)
     over_zero = Capsule(Answer.EXPRESS, 359 * 64, False, np.zeros(32), np.zeros(32, dtype=int))
-    np.testing.assert_allclose(over_zero.angles_deg(3 * 64)[[0, 8, 31]], [359, 0, 2.875])
+    angles, _, _ = over_zero.samples(replace(over_zero, start_q6=3 * 64))
+    np.testing.assert_allclose(angles[[0, 8, 31]], [359, 0, 2.875])
+
+
+def test_an_ultra_capsule_made_by_hand_says_what_it_should() -> None:
+    assert is_capsule(vectors.ULTRA)
+    capsule = read_ultra(vectors.ULTRA)
+    assert (capsule.start_q6, capsule.is_first) == (5 * 64, True)
+    angles, distances, turned = capsule.samples(replace(capsule, start_q6=29 * 64))
+    np.testing.assert_allclose(turned, 5 + np.arange(96) / 4)
+    # 800 mm is code 656, beyond 512 a code counts two; the steps from it and from the next, which is 0, are 3 and 5
+    assert distances[:4].tolist() == [800, 806, 5, 0]
+    assert distances[-3:].tolist() == [0, 800, 800]  # the last cabin's steps are none from the next capsule's first
+    aside = np.degrees(np.radians(8) - (98_361 // 3200 * 64) / (1 << 16))
+    np.testing.assert_allclose((turned[0] - angles[0]) % 360, aside, atol=1e-3)
+    np.testing.assert_allclose((turned[3] - angles[3]) % 360, 7.5, atol=1e-3)
+
+
+def test_twelve_bits_hold_28_metres_the_coarser_the_farther() -> None:
+    codes = np.arange(4096)
+    distance_mm, level = decoded(codes)
+    assert (np.diff(distance_mm) == 1 << level[:-1]).all()
+    np.testing.assert_array_equal(coded(distance_mm)[0], codes)
+    assert (distance_mm[0], distance_mm[-1]) == (0, 28_656)
+    every = np.arange(28_657)
+    back, level = decoded(coded(every)[0])
+    assert ((every - back >= 0) & (every - back < 1 << level)).all()
+
+
+@given(st.integers(0, 360 * 64 - 1), st.lists(st.integers(0, 28_000), min_size=33, max_size=33), st.data())
+def test_what_an_ultra_capsule_says_is_read_again(start_q6: int, majors: list[int], data: st.DataObject) -> None:
+    near = st.integers(-400, 400)
+    rest = np.array(data.draw(st.lists(near, min_size=64, max_size=64))).reshape(32, 2)
+    said = np.column_stack([majors[:-1], np.add(majors[:-1], rest[:, 0]), np.add(majors[1:], rest[:, 1])])
+    said = np.where(said > 0, said, 0).astype(float)
+    said[::7, 1] = 0
+    wire = ultra_bytes(start_q6, said.reshape(-1), float(majors[-1]), is_first=False)
+    assert is_capsule(wire)
+    following = read_ultra(ultra_bytes(start_q6, np.full(96, float(majors[-1])), 0.0, is_first=False))
+    _, heard, _ = read_ultra(wire).samples(following)
+    said = said.reshape(-1)
+    np.testing.assert_array_equal(heard[said == 0] == 0, True)
+    there = (said > 0) & (heard > 0)
+    _, level = coded(np.repeat(np.maximum(majors[:-1], majors[1:]), 3))
+    assert (np.abs(heard - said)[there] <= (1 << level)[there]).all()
+    told_from = np.column_stack([majors[:-1], np.where(majors[:-1], majors[:-1], majors[1:]), majors[1:]]).reshape(-1)
+    lost = (said > 0) & (heard == 0)  # too far from the one that it is told from, or the grain is as coarse as that
+    assert ((np.abs(said - told_from) > 500 << level) | (said < 1 << level))[lost].all()
 
 
 @given(st.data())

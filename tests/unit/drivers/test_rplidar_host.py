@@ -1,5 +1,6 @@
 """An RPLIDAR and its driver's half in simulated time: models and rates, health, stale streams, losses, motor."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,7 +10,7 @@ from drivers.errors import ScannerRefused, ScannerSilent, ScannerTimeout
 from drivers.protocols.conversation import Phase
 from drivers.protocols.rplidar_host import RplidarHost, RplidarOptions
 from drivers.protocols.scanner_events import Advice, Disconnected, PassEnded, Reconnected
-from simulators.devices.rplidar import A1, A1_OLD, A2, S1, Model, RplidarDevice
+from simulators.devices.rplidar import A1, A1_OLD, A2, A3, S1, Model, RplidarDevice, ScanMode
 from tests.unit.drivers.conversation_bench import ConversationBench, flat_scene
 
 
@@ -20,7 +21,13 @@ def bench(device: RplidarDevice | Model = A1, **options: object) -> Conversation
 
 @pytest.mark.parametrize(
     ("model", "mode", "points"),
-    [(A1, "Express", 394), (A1_OLD, "standard", 197), (A2, "express", 800), (S1, "DenseBoost", 920)],
+    [
+        (A1, "Express", 394),
+        (A1_OLD, "standard", 197),
+        (A2, "express", 800),
+        (S1, "DenseBoost", 920),
+        (A3, "Sensitivity", 1600),
+    ],
 )
 def test_each_model_is_found_at_its_rate_and_read_in_the_best_mode_it_has(model: Model, mode: str, points: int) -> None:
     lidar = bench(model).meet()
@@ -38,7 +45,7 @@ def test_each_model_is_found_at_its_rate_and_read_in_the_best_mode_it_has(model:
     tally = lidar.host.tally()
     assert tally.lines.sent == tally.lines.whole == len(lidar.lines)
     for line in lidar.lines:
-        assert abs(len(line.x_mm) - points) <= 32
+        assert abs(len(line.x_mm) - points) <= 96
         ahead = np.abs(line.x_mm) < 150
         # the range is of its own instant, up to a turn after the first sample; angles are rounded to 1/64 degree
         np.testing.assert_allclose(line.z_mm[ahead], -200 - 0.1 * line.line_index, atol=1.5)
@@ -74,6 +81,15 @@ def test_a_mode_that_is_not_there_is_refused_with_those_that_are() -> None:
     lidar.plug()
     lidar.run(10.0, lambda: lidar.host.phase is Phase.UNMET)
     assert str(lidar.host.failure) == "this lidar has no mode 'warp'; its modes are Express, Standard"
+
+
+def test_a_mode_whose_answers_nobody_can_read_is_refused_by_type_and_never_chosen() -> None:
+    hq = replace(A1, modes=(*A1.modes, ScanMode("HQ", 0x83, 63.0, 25.0)), typical=2)
+    lidar = bench(hq, mode="hq")
+    lidar.plug()
+    lidar.run(10.0, lambda: lidar.host.phase is Phase.UNMET)
+    assert "'hq' of this lidar sends answers of type 83h, which this driver does not read" in str(lidar.host.failure)
+    assert bench(hq).meet().host.info.calibration_id.endswith("mode Express")
 
 
 @pytest.mark.parametrize("mode", ["standard", "express"])

@@ -11,7 +11,8 @@ from drivers.protocols.conversation import Phase
 from drivers.protocols.lms_host import LmsHost
 from drivers.protocols.ls100_host import Ls100Host
 from drivers.protocols.rplidar_host import RplidarHost
-from drivers.protocols.scip_host import ScipHost, ScipOptions
+from drivers.protocols.scip_host import ScipHost
+from drivers.protocols.scip_plan import ScipOptions
 from simulators.devices.echoing import EchoingAdapter
 from simulators.devices.lms import LmsDevice
 from simulators.devices.ls100 import Ls100Device

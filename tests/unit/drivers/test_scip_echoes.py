@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from drivers.errors import ScannerRefused
 from drivers.protocols.scip import SCANNING, Reply, ReplyDecoder, data_lines, reply
 from drivers.protocols.scip_echoes import ECHO_STREAMS, NONE, echo_characters, echoes_of
-from drivers.protocols.scip_host import ScipHost, ScipOptions
-from simulators.devices.scip import UTM_30LX, UTM_30LX_EW, ScipDevice
+from drivers.protocols.scip_host import ScipHost
+from drivers.protocols.scip_plan import ScipOptions
+from simulators.devices.scip import ScipDevice
+from simulators.devices.scip_scans import UTM_30LX, UTM_30LX_EW
 from tests.unit.drivers.conversation_bench import ConversationBench
 
 VALUES = st.integers(0, (1 << 18) - 1)

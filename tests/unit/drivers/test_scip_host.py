@@ -8,8 +8,10 @@ import pytest
 from drivers.errors import ScannerNotConnected, ScannerRefused, ScannerSilent, ScannerTimeout
 from drivers.protocols.conversation import Phase
 from drivers.protocols.scanner_events import Advice, ClockJumped, Disconnected, OtherDevice, PassEnded, Reconnected
-from drivers.protocols.scip_host import ScipHost, ScipOptions, scan_bytes
-from simulators.devices.scip import URG_04LX, UTM_30LX, Quirks, ScipDevice
+from drivers.protocols.scip_host import ScipHost
+from drivers.protocols.scip_plan import ScipOptions, scan_bytes
+from simulators.devices.scip import Quirks, ScipDevice
+from simulators.devices.scip_scans import URG_04LX, UTM_30LX
 from tests.unit.drivers.conversation_bench import ConversationBench, flat_scene
 
 AHEAD = (-0.8, 0.8)

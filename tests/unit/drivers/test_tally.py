@@ -7,13 +7,14 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.boot_ledger import BootLedger, Kind
 from drivers.protocols.framing import Damage, DamageReason
 from drivers.protocols.native import Decoder, encode
 from drivers.protocols.native_messages import Chunk, EndReason, Hello, PositionKind, Status
 from drivers.protocols.native_stream import ProfileStream
 from drivers.protocols.unwrap import increase_u32, unwrap_u32
 from drivers.scanline import DeviceInfo, Profile, SensorGeometry
-from drivers.tally import OTHER_PASSES, BootLedger, Kind, PassTally, Tally
+from drivers.tally import OTHER_PASSES, PassTally, Tally
 
 U32 = 2**32
 GEOMETRY = SensorGeometry(np.zeros(3), np.zeros(3), (-1.0, 1.0), 0.001)
@@ -105,7 +106,7 @@ def totals_after(sent: list[Sent], boot_id: int, first: int, pass_index: int, ru
     return status(boot_id, number, line, dropped, first + sum(lines.values()), pass_index, runs)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(schedules(), st.data())
 def test_sent_is_stored_and_lost_by_reason_over_drops_damage_wraps_and_reboots(
     schedule: tuple[list[list[Sent]], int, int], data: st.DataObject
@@ -188,7 +189,7 @@ def test_sent_is_stored_and_lost_by_reason_over_drops_damage_wraps_and_reboots(
     assert numbers == sorted(set(numbers))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.permutations(list(range(12))), st.sampled_from([0, U32 - 5]), st.integers(1, 3), st.data())
 def test_chunks_out_of_order_are_stored_or_late_and_never_counted_twice(
     order: list[int], first: int, chunks_a_line: int, data: st.DataObject
@@ -216,7 +217,7 @@ def test_chunks_out_of_order_are_stored_or_late_and_never_counted_twice(
     assert tally.disagreements == tally.stale == 0
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.lists(st.integers(0, 23) | st.integers(0, 23).map(lambda at: slice(at, at + 8)), max_size=12),
     st.sampled_from([0, U32 - 5]),

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from drivers.boot_ledger import BootLedger
 from drivers.scanline import DeviceInfo, SensorGeometry
-from drivers.tally import BootLedger
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.reporting import report_of
 from scanner_service.sessions.settings import SessionSettings
