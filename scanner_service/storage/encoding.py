@@ -25,7 +25,9 @@ _INDEX_RUNS = 1
 # places, points, index words, reasons, bytes of the device id
 _HEADER = struct.Struct("<2sBB3q4d72sIIIHH")
 _REASON = struct.Struct("<HQ")
-_INT64 = range(-(2**63), 2**63)
+_RUN = struct.Struct("<ii")
+_LEAST_INT64, _MOST_INT64 = -(2**63), 2**63 - 1
+_I4, _F8 = np.dtype("<i4"), np.dtype("<f8")
 
 
 def encode_line(line: StoredLine, version: int = PACKED) -> bytes:
@@ -37,26 +39,29 @@ def encode_line(line: StoredLine, version: int = PACKED) -> bytes:
     """
     points = _shaped(line.xyz_q, np.int32, (len(line.index), 3), "xyz_q")
     index = _shaped(line.index, np.int32, (len(line.index),), "index")
-    vectors = [
-        _shaped(vector, np.float64, (3,), name).astype("<f8", copy=False).tobytes()
-        for name, vector in (("laser_mm", line.laser_mm), ("plane_normal", line.plane_normal), ("travel", line.travel))
-    ]
-    for name in ("boot_id", "pass_index", "line_index"):
-        if getattr(line, name) not in _INT64:
-            raise NotStorable(f"{name} must fit 64 signed bits, not {getattr(line, name)}")
+    vectors = b"".join(
+        (
+            _shaped(line.laser_mm, np.float64, (3,), "laser_mm").astype(_F8, copy=False).data,
+            _shaped(line.plane_normal, np.float64, (3,), "plane_normal").astype(_F8, copy=False).data,
+            _shaped(line.travel, np.float64, (3,), "travel").astype(_F8, copy=False).data,
+        )
+    )
+    for name, number in (("boot_id", line.boot_id), ("pass_index", line.pass_index), ("line_index", line.line_index)):
+        if not _LEAST_INT64 <= number <= _MOST_INT64:
+            raise NotStorable(f"{name} must fit 64 signed bits, not {number}")
     device = _text(line.device_id, "device id")
     coding, words = _encode_index(index)
     try:
         header = _HEADER.pack(
             *(_MAGIC, version, coding, line.boot_id, line.pass_index, line.line_index),
-            *(line.device_time_s, line.position_mm, line.line_spacing_mm, line.step_mm, b"".join(vectors)),
-            *(line.point_count, len(index), len(words), len(line.dropped), len(device)),
+            *(line.device_time_s, line.position_mm, line.line_spacing_mm, line.step_mm, vectors),
+            *(line.point_count, len(index), len(words) // 4, len(line.dropped), len(device)),
         )
         reasons = [_reason(reason, count) for reason, count in line.dropped.items()]
     except struct.error as error:
         raise NotStorable(f"line {line.line_index} of {line.device_id} does not fit the record: {error}") from error
-    coordinates = points.astype("<i4", copy=False).data if version == PLAIN else pack(points)
-    return b"".join((header, device, *reasons, words.data, coordinates))
+    coordinates = points.astype(_I4, copy=False).data if version == PLAIN else pack(points)
+    return b"".join((header, device, *reasons, words, coordinates))
 
 
 def decode_line(encoded: bytes) -> StoredLine:
@@ -111,16 +116,16 @@ def decode_line(encoded: bytes) -> StoredLine:
     )
 
 
-def _encode_index(index: npt.NDArray[np.int32]) -> tuple[int, npt.NDArray[np.int32]]:
+def _encode_index(index: npt.NDArray[np.int32]) -> tuple[int, bytes]:
     """The index as (first, length) of its runs of consecutive places, or as it is where that is shorter."""
     if is_one_run(index):  # nearly every line, and several times faster to tell than to look for runs
-        return _INDEX_RUNS, np.array((index[0], len(index)), dtype="<i4")
+        return _INDEX_RUNS, _RUN.pack(index[0], len(index))
     steps = index[1:].astype(np.int64) - index[:-1]
     starts = np.concatenate([np.zeros(min(len(index), 1), dtype=np.int64), np.flatnonzero(steps != 1) + 1])
     if 2 * len(starts) >= len(index):
-        return _INDEX_RAW, index.astype("<i4", copy=False)
+        return _INDEX_RAW, index.astype(_I4, copy=False).tobytes()
     lengths = np.append(starts[1:], len(index)) - starts
-    return _INDEX_RUNS, np.stack((index[starts], lengths), axis=1).astype("<i4").ravel()
+    return _INDEX_RUNS, np.stack((index[starts], lengths), axis=1).astype(_I4).tobytes()
 
 
 def _decode_index(coding: int, words: npt.NDArray[np.int32], count: int) -> npt.NDArray[np.int32]:
@@ -140,7 +145,7 @@ def _decode_index(coding: int, words: npt.NDArray[np.int32], count: int) -> npt.
 def _shaped(array: Any, dtype: type[np.generic], shape: tuple[int, ...], name: str) -> npt.NDArray[Any]:
     if array.dtype != dtype or array.shape != shape:
         raise NotStorable(f"{name} must be {dtype.__name__} of shape {shape}, not {array.dtype} of {array.shape}")
-    return np.ascontiguousarray(array)
+    return array if array.flags.c_contiguous else np.ascontiguousarray(array)
 
 
 def _reason(reason: str, count: int) -> bytes:

@@ -25,7 +25,7 @@ def pack(xyz_q: npt.NDArray[np.int32]) -> memoryview:
     if len(xyz_q) == 0:
         return memoryview(b"")
     room = np.empty(3 * (_HEAD_BYTES + 4 * len(xyz_q)), dtype=np.uint8)
-    return room[: _pack(np.ascontiguousarray(xyz_q), room)].data
+    return room.data[: _pack(np.ascontiguousarray(xyz_q), room)]
 
 
 def unpack(packed: memoryview, count: int) -> npt.NDArray[np.int32]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 Outcome = Literal["stored", "duplicate", "conflict"]
 
@@ -48,8 +48,7 @@ class EventRow:
     damaged: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Stored:
+class Stored(NamedTuple):
     """The answer to an appended line, given only after its commit has returned.
 
     `duplicate`: this very line was there already, under `line_number`. `conflict`: another line (or a damaged copy of
@@ -60,8 +59,7 @@ class Stored:
     outcome: Outcome
 
 
-@dataclass(frozen=True, slots=True)
-class Watermark:
+class Watermark(NamedTuple):
     """How far one device's lines of one boot are durable: `line_count` of them from `first_index` to `line_index`."""
 
     boot_id: int

@@ -30,9 +30,13 @@ class Tail:
 
     def advance(self, device_id: str, boot_id: int, line_index: int, points: int) -> None:
         """Account for one more line."""
-        mark = self.marks.get((device_id, boot_id), Watermark(boot_id, line_index, line_index, 0))
-        highest, first = max(mark.line_index, line_index), min(mark.first_index, line_index)
-        self.marks[device_id, boot_id] = Watermark(boot_id, highest, first, mark.line_count + 1)
+        key = (device_id, boot_id)
+        mark = self.marks.get(key)
+        if mark is None:
+            self.marks[key] = Watermark(boot_id, line_index, line_index, 1)
+        else:
+            highest, first = max(mark.line_index, line_index), min(mark.first_index, line_index)
+            self.marks[key] = Watermark(boot_id, highest, first, mark.line_count + 1)
         self.latest_boot[device_id] = boot_id
         self.next_line += 1
         self.points += points

@@ -10,8 +10,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Generic, TypeVar
+from dataclasses import replace
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from sqlalchemy import Connection, select
 from sqlalchemy.exc import (
@@ -38,8 +38,7 @@ _DATABASE_REFUSES = (IntegrityError, DataError, ProgrammingError, NotSupportedEr
 _VALUE_FAULTS = (*_DATABASE_REFUSES, OverflowError, TypeError, ValueError)
 
 
-@dataclass(frozen=True, slots=True)
-class Job(Generic[T]):
+class Job(NamedTuple, Generic[T]):
     """Something to be done in a transaction, and the promise of its answer."""
 
     run: Callable[[Batch], T]
@@ -87,7 +86,7 @@ class Writer:
         """
         answer: Answer[T] = Answer(self._door)
         with self._change:
-            if timeout_s > 0:
+            if timeout_s > 0 and not self._has_room(size_bytes):
                 self._change.wait_for(lambda: self._give_up_s is not None or self._has_room(size_bytes), timeout_s)
             if self._give_up_s is not None or not self._has_room(size_bytes):
                 self._counts["refused"] += is_line
