@@ -4,16 +4,13 @@ import os
 import threading
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from drivers.rig import Rig
-from drivers.scanline import DeviceInfo, SensorGeometry
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SessionBusy, SourceUnusable
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec
-from scanner_service.sessions.sources import DeviceSource, PassRequest, ReplaySource
+from scanner_service.sessions.sources import ReplaySource
 from scanner_service.sessions.withdrawals import SCAN_ENDED
 from scanner_service.storage.errors import CreationKeyReused
 from scanner_service.storage.reader import RecordReader
@@ -118,27 +115,6 @@ def test_an_open_session_is_found_while_another_is_being_reopened(book):
         asking.start()
         asking.join(10)
     assert found == [session]
-
-
-class SilentScanner:
-    """Stands in for a scanner that was greeted, and counts what it is told."""
-
-    def __init__(self):
-        self.told = []
-
-    def stop_pass(self):
-        self.told.append("stop_pass")
-
-    def exit(self):
-        self.told.append("exit")
-
-
-def test_a_device_that_was_never_started_is_let_go_of():
-    scanner = SilentScanner()
-    geometry = SensorGeometry(np.array([0.0, 0.0, 90.0]), np.zeros(3), (-9.0, 9.0), 0.01)
-    info = DeviceInfo("SN-1", "M", "F", "C", 77, 100, geometry)
-    DeviceSource(scanner, Rig(), PassRequest(0.2, 0.0, 1.0, 50.0), info).stop()
-    assert scanner.told == ["exit"]
 
 
 @pytest.mark.parametrize("port", ["\0", "/dev/tty\0USB", "/etc/passwd", "/dev/../etc/passwd"])
