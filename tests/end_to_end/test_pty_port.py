@@ -13,6 +13,7 @@ import serial
 
 from simulators.faults import Faults
 from simulators.pty_port import DeviceFailed, LinkPathTaken, PtyPort, SimulatedPortError
+from tests.end_to_end.running import wait_for
 
 BAUD = 115_200
 EVERY_BYTE = bytes(range(256))
@@ -50,7 +51,7 @@ class EchoDevice:
 
 
 def client(path: Path, baud: int = BAUD) -> serial.Serial:
-    return serial.Serial(str(path), baud, timeout=5.0)
+    return serial.Serial(str(path), baud, timeout=60.0)
 
 
 def descriptors() -> int:
@@ -130,8 +131,9 @@ def test_faults_on_the_wire_are_counted() -> None:
     faults = Faults(byte_loss_rate=0.05, piece_bytes=(1, 7))
     with PtyPort(EchoDevice(), BAUD, faults=faults, rng=np.random.default_rng(2)) as port, client(port.path) as host:
         host.write(EVERY_BYTE * 4)
-        host.timeout = 1.0
-        arrived = host.read(1024)
+        wait_for(lambda: port.fault_counts.bytes_in == 1024, "all bytes to be on the wire")
+        arrived = host.read(port.fault_counts.bytes_out)
+        assert host.in_waiting == 0
     counts = port.fault_counts
     assert counts.bytes_in == 1024
     assert counts.lost_bytes > 10
