@@ -14,8 +14,9 @@ from drivers.stages.unmoved import ConstantSpeed
 
 _BACK_S = 120.0
 _JUDGED_AFTER = 100
-_SPACING_FACTOR = 2.0
-"""How many times as far as ordered lines on a conveyor may come apart before the order is nonsense."""
+_TOLD_FACTOR, _REFUSED_FACTOR = 2.0, 10.0
+"""How many times as far as ordered, or as near, lines on a conveyor may come before it is told, and before the order is
+nonsense."""
 _COUNT_SLACK = 0.02
 """Share by which the spacing that clock and speed tell may differ from the one that was counted with."""
 
@@ -102,11 +103,11 @@ class MotionPass:
             return
         spacing_mm, ordered_mm = self._speed / rate_hz, self._drive.order.line_spacing_mm
         come = f"at {self._speed:g} mm/s and {rate_hz:.3g} lines a second they come {spacing_mm:.4g} mm apart"
-        if ordered_mm < spacing_mm / _SPACING_FACTOR:
+        if ordered_mm < spacing_mm / _REFUSED_FACTOR:
             raise DriverError(
                 f"lines {ordered_mm:g} mm apart cannot be had: {come}; order that spacing, or slow down the stage"
             )
-        if ordered_mm > spacing_mm * _SPACING_FACTOR:
+        if not spacing_mm / _TOLD_FACTOR <= ordered_mm <= spacing_mm * _TOLD_FACTOR:
             self._drive.told.event(Advice(f"lines {ordered_mm:g} mm apart were ordered, but {come}"))
 
     def _is_beyond(self) -> bool:
