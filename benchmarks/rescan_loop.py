@@ -40,9 +40,9 @@ GOAL = 0.99
 SHARES = (0.9, 0.95, 0.96, 0.97, 0.98, GOAL)
 STILL_PASSES, STILL_SHARE = 8, 0.001
 """Largest hole first ends when so many passes brought less than this share of the surface."""
-LEAST_MM2 = 2.0
+LEAST_MM2 = 1.0
 """What promises less promises nothing: a plan recommends no pass that brings less."""
-LOST = 2.5
+LOST = 2.1
 """Other ways are followed until they took this many times as long as the loop in all."""
 MAX_PASSES = 40
 

@@ -60,7 +60,7 @@ FIRM_KINDS = (Evidence.MEASURED, Evidence.FLOOR, Evidence.REFERENCE, Evidence.FR
 
 Chances = tuple[float, ...]
 """Good surface for each mm² that is believed in, by `Evidence`; of hidden space before edges are counted for less."""
-FIRST_CHANCES: Chances = (1.0, 1.0, 1.2, 0.9, 1.0, 0.8, 1.0)
+FIRST_CHANCES: Chances = (1.0, 0.75, 1.1, 0.9, 1.0, 0.8, 1.0)
 """... before a pass has shown it."""
 
 

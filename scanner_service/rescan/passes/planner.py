@@ -48,7 +48,7 @@ class Wishes:
 
     density_per_mm2: float
     max_passes: int = 6
-    least_gain_mm2: float = 2.0
+    least_gain_mm2: float = 1.0
     explore: bool = True
     chances: Chances = FIRST_CHANCES
     cell_mm: float | None = None

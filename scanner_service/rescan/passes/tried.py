@@ -50,7 +50,9 @@ class Tried:
         hidden = np.isin(needs.evidence, HIDDEN_KINDS)
         around = np.zeros(len(needs))
         around[hidden] = _times(self.empty_mm, needs.places_mm[hidden], _AROUND_MM)
-        lowered = needs.changed(chance=needs.chance * np.minimum(LOWERED**times, EMPTIED**around))
+        lowered = needs.changed(
+            chance=needs.chance * np.minimum(LOWERED**times, EMPTIED ** np.minimum(around, TRIES - 1))
+        )
         return lowered.only(~given_up), needs.only(given_up)
 
 
