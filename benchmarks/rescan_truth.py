@@ -21,9 +21,10 @@ reason's truth is an inequality (`truth_of`):
     noisy         visible, and the noise there above the limit
 
 q is the share of the rays that return from an incidence, a property of the scanner: 1 - (1 - cos incidence)^e. Beyond
-80° fewer than half of the rays return: such `grazing` surface may be seen or not, and is left out. ρ is the
-required density less 5 % (what a scan cannot tell). `band_of` marks the samples within one radius of a sample of the
-other truth.
+80° fewer than half of the rays return: such `grazing` surface may be seen or not, and is left out. So is surface that
+is turned to the camera by less than 10°: the least unevenness, the facets of a mesh themselves, hides it or not. ρ is
+the required density less 5 % (what a scan cannot tell). `band_of` marks the samples within one radius of a sample of
+the other truth.
 """
 
 from collections.abc import Callable
@@ -144,7 +145,8 @@ class Sight:
 
     `station_mm` is where the laser plane holds the sample, `angle_rad` its place in the fan, `lit` whether the laser
     reaches it (turned to it by at least 10°, nothing in between), `camera` whether the camera does (at any angle),
-    `grazing` whether both do, but the laser at less than 10°,
+    `grazing` whether both do, but the laser at less than 10°, or whether the laser does and it is turned to the camera
+    by less than 10°,
     `in_fan` and `in_range` whether fan, sweep and measurement range hold it. `incidence_rad` is the angle of normal and
     laser ray, `stretch` = |t·m| / sqrt(1 - (n·m)²), `along_mm` the spacing δp' of the rays on the surface, `laser_mm`
     (n, 3) where the laser then stands.
@@ -205,7 +207,9 @@ def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> 
     reached = cosine > 1e-6
     reached[reached] = caster.is_free(lifted[reached], laser[reached])
     lit = reached & (cosine >= _WALL)
-    seen = np.einsum("ij,ij->i", normals, camera - points) > 0
+    to_camera = camera - points
+    towards = np.einsum("ij,ij->i", normals, to_camera) / np.linalg.norm(to_camera, axis=1)
+    seen = towards > 0
     seen[seen] = caster.is_free(lifted[seen], camera[seen])
     height = float(optics.laser_mm[2])
     within = (station >= sweep.stations_mm[0]) & (station <= sweep.stations_mm[-1])
@@ -222,7 +226,7 @@ def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> 
         angle_rad=angle,
         lit=lit,
         camera=seen,
-        grazing=reached & ~lit & seen,
+        grazing=reached & ((~lit & seen) | ((towards > 0) & (towards < _WALL))),
         in_fan=_fan_holds(own, optics) & within,
         in_range=(own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1]),
         incidence_rad=np.arccos(np.clip(cosine, -1.0, 1.0)),

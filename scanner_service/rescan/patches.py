@@ -1,8 +1,12 @@
 """Connected patches of points that fail for one reason, each as a region; knows verdicts, takes none."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -12,7 +16,8 @@ from scanner_service.analysis.snapshot import Int32Array, MapSnapshot
 from scanner_service.rescan.frames import Frames
 from scanner_service.rescan.gaps import Fan, GapKind, Gaps
 from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason
-from scanner_service.rescan.outline import Outlines
+from scanner_service.rescan.kept import Kept
+from scanner_service.rescan.outline import patch_of
 from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of, succession
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.stations import IntArray, Stations
@@ -49,7 +54,7 @@ def patches(
     gaps: Gaps,
     judgement: Judgement,
     unfolded: Unfolded,
-    outlines: Outlines,
+    kept: Kept[RescanRegion],
     reason: Reason,
     noise_mm: float | None,
 ) -> tuple[list[RescanRegion], list[IntArray]]:
@@ -81,23 +86,35 @@ def patches(
     groups = np.split(rows[by_label], np.flatnonzero(np.diff(label[by_label])) + 1)
     np.maximum.at(connection, place[links[:, 0]], span)
     np.maximum.at(connection, place[links[:, 1]], span)
-    large = [
-        _region(
-            snapshot,
-            requirement,
-            strips,
-            judgement,
-            unfolded,
-            outlines,
-            reason,
-            group,
-            connection[place[group]],
-            noise_mm,
-        )
-        for group in groups
-        if len(group) >= requirement.region_points
-    ]
+    large = []
+    for group in groups:
+        if len(group) >= requirement.region_points:
+            reaches = connection[place[group]]
+            make = partial(
+                _region, snapshot, requirement, strips, judgement, unfolded, reason, group, reaches, noise_mm
+            )
+            large.append(kept.made(_made_of(snapshot, strips, judgement, unfolded, reason, group, reaches), make))
     return large, [group for group in groups if len(group) < requirement.region_points]
+
+
+def _made_of(
+    snapshot: MapSnapshot,
+    strips: Strips,
+    judgement: Judgement,
+    unfolded: Unfolded,
+    reason: Reason,
+    rows: IntArray,
+    connection_mm: Float64Array,
+) -> Iterator[npt.NDArray[Any]]:
+    """All that a region is made from and that may be other at the next verdict; points stay where they are."""
+    yield np.array([reason])
+    yield rows
+    yield connection_mm
+    yield snapshot.normals[rows]
+    yield unfolded.mm(rows)
+    for of in (strips, judgement):
+        for name in of.__slots__:
+            yield getattr(of, name)[rows]
 
 
 def _links(
@@ -165,7 +182,6 @@ def _region(
     strips: Strips,
     judgement: Judgement,
     unfolded: Unfolded,
-    outlines: Outlines,
     reason: Reason,
     rows: IntArray,
     connection_mm: Float64Array,
@@ -181,7 +197,7 @@ def _region(
     flat = np.concatenate([unfolded.mm(rows), 0.5 * (unfolded.mm(owner) + unfolded.mm(other))])
     connection = np.concatenate([connection_mm, connection_mm[np.searchsorted(rows, owner)]])
     spacing = np.fmin(strips.nominal_point_spacing_mm[np.concatenate([rows, owner])], connection)
-    patch = outlines.patch_of(points, connection, spacing, flat if one_pass else None)
+    patch = patch_of(points, connection, spacing, flat if one_pass else None)
     normal = mean_normal(snapshot.normals[rows])
     if np.isnan(normal).any():
         towards = snapshot.lines.laser_mm[snapshot.line[rows]].mean(axis=0) - patch.centroid_mm

@@ -8,7 +8,7 @@ from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
 from scanner_service.analysis.snapshot import MapSnapshot, UInt8Array
 from scanner_service.rescan.gaps import GapKind, Gaps, gap_lengths_mm
 from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason
-from scanner_service.rescan.outline import Outlines
+from scanner_service.rescan.kept import Kept
 from scanner_service.rescan.patches import UPRIGHT, Unfolded, patches
 from scanner_service.rescan.points import PointVerdicts
 from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of, succession
@@ -93,7 +93,7 @@ class RegionFinder:
         self._requirement = requirement or Requirement()
         self._noise_mm = noise_mm
         self._points = PointVerdicts(self._requirement, geometry, noise_mm, towards_sensor)
-        self._outlines = Outlines()
+        self._kept: Kept[RescanRegion] = Kept()
 
     def find(self, snapshot: MapSnapshot, changed: IntArray | None = None) -> RegionReport:
         """Find what is worth another pass.
@@ -104,7 +104,7 @@ class RegionFinder:
         changed : (k,) rows of it that are new or other than when regions were found last; None: any may be.
         """
         points = self._points.renew(snapshot, changed)
-        self._outlines.new_round()
+        self._kept.new_round()
         requirement, strips = self._requirement, points.strips
         ribbons = shadow_ribbons(snapshot, requirement, strips, points.gaps)
         ribbons, gaps, judgement = _flanks_completed(snapshot, ribbons, strips, points.gaps, points.judgement)
@@ -114,7 +114,7 @@ class RegionFinder:
         for reason in Reason:
             if reason not in (Reason.NONE, Reason.SHADOW):
                 large, few = patches(
-                    snapshot, requirement, strips, gaps, judgement, unfolded, self._outlines, reason, self._noise_mm
+                    snapshot, requirement, strips, gaps, judgement, unfolded, self._kept, reason, self._noise_mm
                 )
                 drafts += large
                 small += [(reason, len(rows), _nominal_area(strips, rows)) for rows in few]
