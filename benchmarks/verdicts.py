@@ -17,6 +17,7 @@ import numpy as np
 
 from benchmarks.cloud import NOISE_MM, make_lines
 from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.rescan.coverage import CoverageBook
 from scanner_service.rescan.regions import RegionFinder
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.cadence import HURRIED_SHARE, VERDICT_PERIOD_S, VERDICT_SHARE
@@ -73,14 +74,15 @@ def main() -> None:
     chosen = parser.parse_args()
     sizes, geometry = sorted(chosen.points), demo_scanner().geometry()
     live = LiveMap(MapSettings(noise_mm=NOISE_MM, max_points=sizes[-1] + 400_000))
-    mirror, engine, finder = Mirror(), _Engine(live), RegionFinder(Requirement(), geometry)
+    analyst = Mirror(), _Engine(live), RegionFinder(Requirement(), geometry), CoverageBook()
+    mirror, engine = analyst[:2]
     lines = iter(make_lines(sizes[-1] + 350_000))
     for size in sizes:
         while len(live) < size:
             live.add(next(lines))
             if live.line_count % 100 == 0:
                 mirror.catch_up(engine, engine)
-        _judged(mirror, engine, finder)
+        _judged(*analyst)
         costs_s = []
         for _ in range(2):
             for line in islice(lines, chosen.lines):
@@ -88,7 +90,7 @@ def main() -> None:
             live.refresh()
             with Ticker() as ticker:
                 begun_s = time.thread_time()
-                results = _judged(mirror, engine, finder)
+                results = _judged(*analyst)
                 costs_s.append(time.thread_time() - begun_s)
         _tell(results, min(costs_s), ticker, live)
         if not chosen.no_whole:
@@ -99,12 +101,12 @@ def main() -> None:
     live.close()
 
 
-def _judged(mirror: Mirror, engine: "_Engine", finder: RegionFinder) -> Results:
+def _judged(mirror: Mirror, engine: "_Engine", finder: RegionFinder, coverage: CoverageBook) -> Results:
     """What a session's analyst does for a verdict."""
     mirror.catch_up(engine, engine)
     snapshot = mirror.snapshot()
     report = finder.find(snapshot, mirror.take_changed().astype(np.int64))
-    return conclude(snapshot, Requirement(), report)
+    return conclude(snapshot, Requirement(), report, coverage.renew(snapshot, report, finder.renewed))
 
 
 def _same(one: Results, other: Results) -> bool:

@@ -47,7 +47,10 @@ _ROWS = ("chain", "link", "beside", "order")  # of strips: rows of the map
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """All that is measured and judged of the points of one map; arrays of their own, that a later renewal leaves."""
+    """All that is measured and judged of the points of one map; arrays of their own, that a later renewal leaves.
+
+    `rows` (k,) are the points that were judged again for it.
+    """
 
     stations: Stations
     frames: Frames
@@ -55,6 +58,7 @@ class Judged:
     fan: Fan
     gaps: Gaps
     judgement: Judgement
+    rows: IntArray
 
 
 class PointVerdicts:
@@ -98,11 +102,12 @@ class PointVerdicts:
         other = np.zeros(len(core), dtype=bool)
         other[snapshot.line[marks != self._columns.view("marks", len(snapshot))]] = True
         self._columns.put(slice(len(snapshot)), marks=marks)
-        self._judge(snapshot, stations, frames, core | _with_adjacent(stations, other, 1))
+        rows = self._judge(snapshot, stations, frames, core | _with_adjacent(stations, other, 1))
         everything = slice(len(snapshot))
         return Judged(
             stations, frames, self._strips(everything), self._fan(everything), gaps,
             Judgement(**self._columns.copies("judgement", everything)),
+            rows,
         )  # fmt: skip
 
     def _is_another(self, snapshot: MapSnapshot, changed: IntArray) -> bool:
@@ -195,15 +200,13 @@ class PointVerdicts:
             nothing = np.zeros(int(is_core.sum()), dtype=np.uint8)
             self._columns.put(rows[is_core], **{f"kind.{side}": nothing})
             second = rows[pairs.second[kept]]
-            self._columns.put(
-                second,
-                **{
-                    f"kind.{side}": pairs.kind[kept],
-                    f"first.{side}": rows[pairs.first[kept]],
-                    f"is_down.{side}": pairs.is_down[kept],
-                    f"filled.{side}": np.zeros(len(second), dtype=bool),
-                },
-            )
+            found: dict[str, npt.NDArray[Any]] = {
+                f"kind.{side}": pairs.kind[kept],
+                f"first.{side}": rows[pairs.first[kept]],
+                f"is_down.{side}": pairs.is_down[kept],
+                f"filled.{side}": np.zeros(len(second), dtype=bool),
+            }
+            self._columns.put(second, **found)
             renewed.append(second)
         return renewed
 
@@ -245,8 +248,8 @@ class PointVerdicts:
         beyond = ~(inside(snapshot.points_mm[gaps.high]) | inside(snapshot.points_mm[gaps.low]))
         return replace(gaps, kind=np.where(beyond, np.uint8(GapKind.HOLE), gaps.kind))
 
-    def _judge(self, snapshot: MapSnapshot, stations: Stations, frames: Frames, lines_judged: BoolArray) -> None:
-        """Judge the points of some lines anew."""
+    def _judge(self, snapshot: MapSnapshot, stations: Stations, frames: Frames, lines_judged: BoolArray) -> IntArray:
+        """Judge the points of some lines anew; their rows."""
         around = _with_adjacent(stations, lines_judged, _HOPS)
         if self._looks_around(frames):
             own = _with_adjacent(stations, lines_judged, 1)
@@ -270,6 +273,7 @@ class PointVerdicts:
         self._columns.put(
             rows[is_own], **{f"judgement.{name}": getattr(found, name)[is_own] for name in Judgement.__slots__}
         )
+        return rows[is_own]
 
     def _looks_around(self, frames: Frames) -> bool:
         """Whether verdicts hang on points of lines that are neither adjacent nor under the same rays."""

@@ -94,6 +94,7 @@ class RegionFinder:
         self._noise_mm = noise_mm
         self._points = PointVerdicts(self._requirement, geometry, noise_mm, towards_sensor)
         self._kept: Kept[RescanRegion] = Kept()
+        self.renewed: IntArray = np.zeros(0, dtype=np.int64)  # rows that were measured and judged again at last
 
     def find(self, snapshot: MapSnapshot, changed: IntArray | None = None) -> RegionReport:
         """Find what is worth another pass.
@@ -104,6 +105,7 @@ class RegionFinder:
         changed : (k,) rows of it that are new or other than when regions were found last; None: any may be.
         """
         points = self._points.renew(snapshot, changed)
+        self.renewed = points.rows
         self._kept.new_round()
         requirement, strips = self._requirement, points.strips
         ribbons = shadow_ribbons(snapshot, requirement, strips, points.gaps)
