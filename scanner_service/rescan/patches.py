@@ -18,7 +18,7 @@ from scanner_service.rescan.gaps import Fan, GapKind, Gaps
 from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason
 from scanner_service.rescan.kept import Kept
 from scanner_service.rescan.outline import patch_of
-from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of, succession
+from scanner_service.rescan.region import Limit, RescanRegion, mean_normal, priority_of, succession
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.stations import IntArray, Stations
 from scanner_service.rescan.strips import Strips
@@ -235,9 +235,42 @@ def _region(
         point_count=len(rows),
         remedy=REMEDIES[reason],
         point_rows=rows,
+        limit=_limit(snapshot, requirement, strips, judgement, reason, rows, float(np.median(by_count)), limit),
         confidence=succession(int(_fails_alone(judgement, rows, values, required).sum()), len(rows)),
         line_spacing_mm=allowed,
     )
+
+
+def _limit(
+    snapshot: MapSnapshot,
+    requirement: Requirement,
+    strips: Strips,
+    judgement: Judgement,
+    reason: Reason,
+    rows: IntArray,
+    counted_per_mm2: float,
+    noise_limit_mm: float | None,
+) -> Limit | None:
+    """Which limit the patch misses; a strip that is too wide goes before what follows from it, the density."""
+    if reason is Reason.OUT_OF_RANGE:
+        return None
+    if reason is Reason.NOISY and noise_limit_mm is not None:
+        return Limit("noise", float(np.median(judgement.noise_mm[rows])), noise_limit_mm, "mm")
+    wide = rows[judgement.failing_strip[rows].any(axis=1)]
+    if 2 * len(wide) >= len(rows):
+        widest = np.where(judgement.failing_strip[wide], judgement.width_mm[wide], -np.inf).max(axis=1)
+        largest = np.fmin(judgement.allowed_mm[wide], strips.reach_mm[wide] if reason is Reason.STEEP else np.inf)
+        return Limit("line_spacing", float(np.median(widest)), float(np.median(largest)), "mm")
+    if reason is Reason.STEEP and requirement.incidence_rad is not None:
+        ray = snapshot.lines.laser_mm[snapshot.line[rows]] - snapshot.points_mm[rows]
+        cosine = np.einsum("ij,ij->i", ray, snapshot.normals[rows]) / np.linalg.norm(ray, axis=1)
+        known = np.abs(cosine[np.isfinite(cosine)])
+        leaning = float(np.arccos(np.clip(np.median(known), 0.0, 1.0))) if len(known) else 0.0
+        if leaning > requirement.incidence_rad:
+            return Limit("incidence", float(np.degrees(leaning)), float(np.degrees(requirement.incidence_rad)), "°")
+    by_spacing = float(np.fmin(np.median(judgement.spacing_per_mm2[rows]), np.inf))
+    density = min(counted_per_mm2, by_spacing)
+    return Limit("density", density, float(np.median(judgement.required_per_mm2[rows])), "points/mm²")
 
 
 def _fails_alone(judgement: Judgement, rows: IntArray, values: Float64Array, required: float) -> BoolArray:
