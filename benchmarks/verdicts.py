@@ -104,8 +104,8 @@ def main() -> None:
 def _judged(mirror: Mirror, engine: "_Engine", finder: RegionFinder, coverage: CoverageBook) -> Results:
     """What a session's analyst does for a verdict."""
     mirror.catch_up(engine, engine)
-    snapshot = mirror.snapshot()
-    report = finder.find(snapshot, mirror.take_changed().astype(np.int64))
+    snapshot, changed = mirror.changes()
+    report = finder.find(snapshot, changed)
     return conclude(snapshot, Requirement(), report, coverage.renew(snapshot, report, finder.renewed))
 
 

@@ -114,7 +114,7 @@ class CoverageBook:
         judged = report.judgement.judged
         side = self._asked_mm
         if side is None:
-            side = float(np.median(report.strips.reach_mm[judged])) if judged.any() else float("nan")
+            side = float(np.median(report.spacings.reach_mm[judged])) if judged.any() else float("nan")
         if renewed is None or len(snapshot) < self._count:
             self._forget(side)
         self._extent_mm = max(self._extent_mm, _extent_mm(snapshot, self._count))
@@ -176,8 +176,8 @@ class CoverageBook:
             return average
 
         stands_for = _surface_of_points(report, rows)
-        passes = int(report.strips.group.max(initial=-1)) + 1
-        by_pass = _added_up(own, report.strips.group[rows], stands_for, len(cells), passes)
+        passes = int(report.spacings.group.max(initial=-1)) + 1
+        by_pass = _added_up(own, report.spacings.group[rows], stands_for, len(cells), passes)
         votes = _added_up(own, report.reason[rows].astype(np.int64), stands_for, len(cells), len(Reason))
         self._cells.put(
             cells,
@@ -211,7 +211,7 @@ def _surface_of_points(report: RegionReport, rows: IntArray) -> Float64Array:
 
     At a border of the part the one strip counts on both sides, where no strip is known the nominal line spacing.
     """
-    strips = report.strips
+    strips = report.spacings
     width = report.judgement.width_mm[rows]
     known = np.isfinite(width).sum(axis=1)
     total = np.where(np.isfinite(width), width, 0.0).sum(axis=1)

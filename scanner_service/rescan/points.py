@@ -47,7 +47,7 @@ _ROWS = ("chain", "link", "beside", "order")  # of strips: rows of the map
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """All that is measured and judged of the points of one map; arrays of their own, that a later renewal leaves.
+    """All that is measured and judged of the points of one map; `strips` and `fan` are so until the next renewal only.
 
     `rows` (k,) are the points that were judged again for it.
     """
@@ -104,11 +104,9 @@ class PointVerdicts:
         self._columns.put(slice(len(snapshot)), marks=marks)
         rows = self._judge(snapshot, stations, frames, core | _with_adjacent(stations, other, 1))
         everything = slice(len(snapshot))
-        return Judged(
-            stations, frames, self._strips(everything), self._fan(everything), gaps,
-            Judgement(**self._columns.copies("judgement", everything)),
-            rows,
-        )  # fmt: skip
+        strips, fan = Strips(**self._columns.views("strips", everything)), Fan(**self._columns.views("fan", everything))
+        judgement = Judgement(**self._columns.copies("judgement", everything))
+        return Judged(stations, frames, strips, fan, gaps, judgement, rows)
 
     def _is_another(self, snapshot: MapSnapshot, changed: IntArray) -> bool:
         """Whether the map is one that nothing is known of: points that counted do not any more, or the other way."""
@@ -186,9 +184,11 @@ class PointVerdicts:
         strips, fan = strips_of(excerpt, own_stations, frames, self._requirement), self._fan(rows)
         is_core = core[lines][excerpt.line]
         home = np.append(rows, -1)
-        values = {f"strips.{name}": getattr(strips, name)[is_core] for name in Strips.__slots__}
-        values |= {f"strips.{name}": home[values[f"strips.{name}"]] for name in _ROWS}
-        self._columns.put(rows[is_core], **values)
+        own = slice(None) if is_core.all() else is_core  # no copies of a whole map
+        values = {f"strips.{name}": getattr(strips, name)[own] for name in Strips.__slots__}
+        values |= {f"strips.{name}": home[values[f"strips.{name}"]].astype(np.int32) for name in _ROWS}
+        self._columns.put(rows[own], **values)
+        del values
         renewed = []
         for side, pairs in enumerate(find_pairs(excerpt, own_stations, frames, strips, fan, self._geometry)):
             kept = is_core[pairs.first] | is_core[pairs.second]
@@ -202,7 +202,7 @@ class PointVerdicts:
             second = rows[pairs.second[kept]]
             found: dict[str, npt.NDArray[Any]] = {
                 f"kind.{side}": pairs.kind[kept],
-                f"first.{side}": rows[pairs.first[kept]],
+                f"first.{side}": rows[pairs.first[kept]].astype(np.int32),
                 f"is_down.{side}": pairs.is_down[kept],
                 f"filled.{side}": np.zeros(len(second), dtype=bool),
             }
@@ -269,7 +269,9 @@ class PointVerdicts:
             self._noise_mm,
             self._asked,
         )
-        is_own = lines_judged[lines][excerpt.line]
+        is_own: BoolArray | slice = lines_judged[lines][excerpt.line]
+        if lines_judged[lines].all():
+            is_own = slice(None)
         self._columns.put(
             rows[is_own], **{f"judgement.{name}": getattr(found, name)[is_own] for name in Judgement.__slots__}
         )

@@ -15,7 +15,7 @@ from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.ribbons import Ribbon, shadow_ribbons
 from scanner_service.rescan.stations import IntArray
-from scanner_service.rescan.strips import Strips
+from scanner_service.rescan.strips import Spacings, Strips
 
 _SHARED = 1.0 / 3.0  # share of a ribbon's upper or lower ends that makes it part of a flank
 _FOOT = 4.0  # radii: how long the foot of a flank may be that has no gaps of its own
@@ -40,8 +40,8 @@ class RegionReport:
     any region (a patch smaller than the requirement asks). `counts` are points by verdict: `ok`, each reason,
     `unsettled`, `not_counted`, `requirement_unknown`, and `outside_interest` where there is a region of interest; they
     add up to n. `small_patches` are, by reason, the patches that are too small to be regions; the area of those with
-    fewer points than a region is taken from the nominal spacings. `judgement`, `strips` and `gaps` are what the report
-    was made from.
+    fewer points than a region is taken from the nominal spacings. `judgement`, `spacings` and `gaps` are what the
+    report was made from.
     """
 
     version: int
@@ -51,7 +51,7 @@ class RegionReport:
     counts: dict[str, int]
     small_patches: dict[str, SmallPatches]
     judgement: Judgement
-    strips: Strips
+    spacings: Spacings
     gaps: Gaps
 
     @property
@@ -141,7 +141,7 @@ class RegionFinder:
             counts=_counts(snapshot, judgement, requirement),
             small_patches=_by_reason(small),
             judgement=judgement,
-            strips=strips,
+            spacings=Spacings(**{name: getattr(strips, name).copy() for name in Spacings.__slots__}),
             gaps=gaps,
         )
 

@@ -113,8 +113,8 @@ class Judgement:
             with self._mirroring:
                 read_s = self._now_s()
                 self._mirror.catch_up(self._ask, self._ask_between)
-                snapshot, changed = self._mirror.snapshot(), self._mirror.take_changed()
-            report, coverage = self._found_again(snapshot, changed.astype(np.int64), source)
+                snapshot, changed = self._mirror.changes()
+            report, coverage = self._found_again(snapshot, changed, source)
             nominal = self._nominal
             found = conclude(snapshot, self._requirement, report, coverage, nominal.surface, nominal.refused)
             with self._in_force:

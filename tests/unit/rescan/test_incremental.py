@@ -116,8 +116,8 @@ class Analyst:
     def check(self) -> int:
         """Judge what changed; how many points that took."""
         self._mirror.catch_up(lambda question: question(self.live), lambda question: question(self.live))
-        snapshot = self._mirror.snapshot()
-        again = self._finder.find(snapshot, self._mirror.take_changed().astype(np.int64))
+        snapshot, changed = self._mirror.changes()
+        again = self._finder.find(snapshot, changed)
         anew = find_regions(snapshot, self._requirement, *self._seen)
         same(again, anew)
         renewed = self._finder.renewed
