@@ -7,7 +7,7 @@ what changed, a page at a time between scanlines; all further work is done on th
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -87,8 +87,8 @@ class Mirror:
         for part in self._changed:
             is_in[part] = True
         self._changed.clear()
-        whole = replace(self._latest, **self._described.copies("point", slice(self._total)))
-        return whole, np.flatnonzero(is_in).astype(np.int64)
+        points: dict[str, Any] = self._described.copies("point", slice(self._total))
+        return replace(self._latest, **points), np.flatnonzero(is_in).astype(np.int64)
 
     def _put(self, rows: Int32Array, records: Records) -> None:
         self._latest = news = records.describe()
