@@ -21,9 +21,11 @@ reason's truth is an inequality (`truth_of`):
     noisy         visible, and the noise there above the limit
 
 q is the share of the rays that return from an incidence, a property of the scanner: 1 - (1 - cos incidence)^e. Beyond
-80° fewer than half of the rays return: such `grazing` surface may be seen or not, and is left out. ρ is the
-required density less 5 % (what a scan cannot tell). `band_of` marks the samples within one radius of a sample of the
-other truth.
+80° fewer than half of the rays return: such `grazing` surface may be seen or not, and is left out. So is surface that
+is turned to the camera by less than 10°, and what beside it (0.5 mm) is turned away by less than 10°: the least
+unevenness, the facets of a mesh themselves, hides it or not. ρ is the required density less 5 % (what a scan cannot
+tell). `band_of` marks the samples within one radius of a sample of
+the other truth.
 """
 
 from collections.abc import Callable
@@ -44,6 +46,7 @@ _LIFT_MM = 0.01  # sights start this far off the surface: rays are cast in singl
 _GRAZING = 0.5  # cosine of 60°
 _WALL = float(np.cos(np.radians(80.0)))
 _SLACK = 1.05
+_UNEVEN_MM = 0.5  # unevenness of a surface is no longer than this
 _DIRECTIONS = 32
 _FAR_MM = 25.0  # how far a shadow's surface looks for the space beside it
 _SHARES = (0.1, 0.35, 0.65, 0.95)  # ... and at which shares of that way
@@ -144,7 +147,8 @@ class Sight:
 
     `station_mm` is where the laser plane holds the sample, `angle_rad` its place in the fan, `lit` whether the laser
     reaches it (turned to it by at least 10°, nothing in between), `camera` whether the camera does (at any angle),
-    `grazing` whether both do, but the laser at less than 10°,
+    `grazing` whether both do, but the laser at less than 10°, or whether the laser does and it is turned to the camera
+    by less than 10°, or beside such surface away from it by less than 10°,
     `in_fan` and `in_range` whether fan, sweep and measurement range hold it. `incidence_rad` is the angle of normal and
     laser ray, `stretch` = |t·m| / sqrt(1 - (n·m)²), `along_mm` the spacing δp' of the rays on the surface, `laser_mm`
     (n, 3) where the laser then stands.
@@ -205,7 +209,9 @@ def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> 
     reached = cosine > 1e-6
     reached[reached] = caster.is_free(lifted[reached], laser[reached])
     lit = reached & (cosine >= _WALL)
-    seen = np.einsum("ij,ij->i", normals, camera - points) > 0
+    to_camera = camera - points
+    towards = np.einsum("ij,ij->i", normals, to_camera) / np.linalg.norm(to_camera, axis=1)
+    seen = towards > 0
     seen[seen] = caster.is_free(lifted[seen], camera[seen])
     height = float(optics.laser_mm[2])
     within = (station >= sweep.stations_mm[0]) & (station <= sweep.stations_mm[-1])
@@ -222,7 +228,7 @@ def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> 
         angle_rad=angle,
         lit=lit,
         camera=seen,
-        grazing=reached & ~lit & seen,
+        grazing=reached & ((~lit & seen) | _camera_grazes(points, reached, towards)),
         in_fan=_fan_holds(own, optics) & within,
         in_range=(own[:, 2] >= optics.range_mm[0]) & (own[:, 2] <= optics.range_mm[1]),
         incidence_rad=np.arccos(np.clip(cosine, -1.0, 1.0)),
@@ -230,6 +236,20 @@ def sight_of(caster: Caster, samples: Samples, optics: Optics, sweep: Sweep) -> 
         along_mm=np.nan_to_num(along, nan=np.inf),
         laser_mm=laser,
     )
+
+
+def _camera_grazes(points_mm: Floats, lit: Bools, towards: Floats) -> Bools:
+    """(n,) True of lit surface turned to the camera by less than 10°, or away by less beside such surface.
+
+    `towards` (n,) is the cosine of the camera's incidence, below 0 where the surface is turned away.
+    """
+    edge = lit & (np.abs(towards) < _WALL)
+    found: Bools = edge & (towards > 0)
+    away = np.flatnonzero(edge & ~found)
+    if found.any() and len(away):
+        apart = cKDTree(points_mm[found]).query(points_mm[away], distance_upper_bound=_UNEVEN_MM)[0]
+        found[away] = np.isfinite(apart)
+    return found
 
 
 def truth_of(

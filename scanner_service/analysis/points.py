@@ -103,14 +103,4 @@ def gather_points(
         taken_place[i] = place[rows[i]]
 
 
-@njit(cache=True, nogil=True)
-def put_points(
-    points: PointArray, place: Int32Array, rows: Int32Array, taken: PointArray, taken_place: Int32Array
-) -> None:
-    """Write what `gather_points` took to the same rows (m,) of another table."""
-    for i in range(len(rows)):
-        points[rows[i]] = taken[i]
-        place[rows[i]] = taken_place[i]
-
-
 NOT_COUNTED = int(Unreliable.NOT_COUNTED)

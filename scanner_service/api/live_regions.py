@@ -38,6 +38,7 @@ def _look(region: RescanRegion) -> tuple[object, ...]:
         region.reason,
         region.remedy,
         region.point_count,
+        region.limit,
         region.history,
         np.array([*numbers, *region.centroid_mm, *region.normal]).tobytes(),  # as bytes an unknown number equals itself
         *(loop.tobytes() for loop in region.outline_mm),

@@ -31,7 +31,7 @@ class Boxes:
     def meet(self, others: "Boxes") -> BoolArray:
         """(b,) True for those that meet one of the others; for some that only come near to many others, too."""
         meets = np.zeros(len(self), dtype=bool)
-        full = others.part((others.low_mm <= others.high_mm).all(axis=1))
+        full = others.part(np.flatnonzero((others.low_mm <= others.high_mm).all(axis=1)))
         if not len(full):
             return meets
         start = np.unique(np.linspace(0, len(full), _MANY, endpoint=False).astype(np.int64))

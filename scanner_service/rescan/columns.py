@@ -16,10 +16,10 @@ class Columns:
         self._rows = 0
 
     def make_room(self, rows: int) -> None:
-        """Let every array have so many rows at least, and for a growing map half as many more."""
+        """Let every array have so many rows at least, and for a growing map a quarter more."""
         if rows <= self._rows:
             return
-        self._rows = max(rows + rows // 2, _LEAST_ROWS)
+        self._rows = max(rows + rows // 4, _LEAST_ROWS)
         for name, old in self._arrays.items():
             self._arrays[name] = np.concatenate([old, np.zeros((self._rows - len(old), *old.shape[1:]), old.dtype)])
 

@@ -7,16 +7,29 @@ little. Without a reference surface this is *observed* coverage: what nobody saw
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import MapSnapshot, UInt8Array
+from scanner_service.rescan.columns import Columns
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.regions import RegionReport
+from scanner_service.rescan.stations import IntArray
 
 Int32Array = npt.NDArray[np.int32]
+
+_FAR = 2**20 - 2  # cells are counted this far from the first point
+_NO_CELLS: dict[str, Any] = {
+    "centre_mm": np.zeros((0, 3)),
+    "area_mm2": np.zeros(0),
+    "density_per_mm2": np.zeros(0),
+    "required_per_mm2": np.zeros(0),
+    "reason": np.zeros(0, np.uint8),
+    "meets": np.zeros(0, bool),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,77 +84,137 @@ class Coverage:
 def observed_coverage(snapshot: MapSnapshot, report: RegionReport, cell_mm: float | None = None) -> Coverage:
     """Coverage and density map of a report; cells of side `cell_mm`, by default the median radius of the points.
 
+    Where a map is wider than a million cells they are twice as large, or four times: as large as that takes.
+
     Raises
     ------
     ValueError : when the cell's side is not a positive finite number.
     """
-    if cell_mm is not None and not (np.isfinite(cell_mm) and cell_mm > 0):
-        raise ValueError(f"cell_mm must be greater than 0 mm, not {cell_mm}")
-    judgement, strips = report.judgement, report.strips
-    gap_mm2 = report.gap_mm2
-    rows = np.flatnonzero(judgement.judged)
-    if not len(rows):
-        none = np.zeros(0)
-        side = np.nan if cell_mm is None else cell_mm
-        empty = (
-            np.zeros((0, 3)),
-            none,
-            none.copy(),
-            none.copy(),
-            np.zeros(0, np.uint8),
-            np.zeros(0, bool),
-            np.zeros(0, np.int32),
+    return CoverageBook(cell_mm).renew(snapshot, report)
+
+
+class CoverageBook:
+    """Coverage of one map that grows: cells whose points are judged as they were are not looked at again."""
+
+    def __init__(self, cell_mm: float | None = None) -> None:
+        if cell_mm is not None and not (np.isfinite(cell_mm) and cell_mm > 0):
+            raise ValueError(f"cell_mm must be greater than 0 mm, not {cell_mm}")
+        self._asked_mm = cell_mm
+        self._forget(float("nan"))
+
+    def _forget(self, side_mm: float, extent_mm: float = 0.0) -> None:
+        self._side_mm, self._extent_mm = side_mm, extent_mm
+        self._points, self._cells = Columns(), Columns()
+        self._known = np.zeros(0, dtype=np.int64)  # keys of the cells, rising, and their rows
+        self._row = np.zeros(0, dtype=np.int64)
+        self._count = 0
+
+    def renew(self, snapshot: MapSnapshot, report: RegionReport, renewed: IntArray | None = None) -> Coverage:
+        """Coverage of a report; `renewed` (k,) are the rows that were measured or judged again, None: all were."""
+        judged = report.judgement.judged
+        side = self._asked_mm
+        if side is None:
+            side = float(np.median(report.spacings.reach_mm[judged])) if judged.any() else float("nan")
+        if renewed is None or len(snapshot) < self._count:
+            self._forget(side)
+        self._extent_mm = max(self._extent_mm, _extent_mm(snapshot, self._count))
+        while np.isfinite(side) and self._extent_mm >= _FAR * side:
+            side *= 2.0
+        if renewed is None or side != self._side_mm:
+            self._forget(side, self._extent_mm)
+            renewed = np.arange(len(snapshot), dtype=np.int64)
+        if np.isfinite(side):
+            self._enter(snapshot, side)
+            self._measure(snapshot, report, renewed)
+        by_place = self._row[self._cells.view("points", len(self._row))[self._row] > 0] if self._count else self._row
+        kept = self._cells.copies("cell", by_place) if len(by_place) else _NO_CELLS
+        area, meets = kept["area_mm2"], kept["meets"]
+        points = self._cells.view("points", len(self._row))[by_place] if len(by_place) else np.zeros(0, np.int32)
+        whole = float(area.sum()) + report.gap_mm2
+        share = float(area[meets].sum()) / whole if whole > 0 and len(area) else float("nan")
+        return Coverage(cell_mm=side, **kept, points=points, gap_mm2=report.gap_mm2, share=share)
+
+    def _enter(self, snapshot: MapSnapshot, side_mm: float) -> None:
+        """Find the cells of the points that are new; points never move."""
+        fresh = np.arange(self._count, len(snapshot), dtype=np.int64)
+        cube = np.floor(snapshot.points_mm[fresh] / side_mm).astype(np.int64)
+        cube -= np.floor(snapshot.points_mm[:1] / side_mm).astype(np.int64)
+        key = ((cube[:, 0] + _FAR) << 42) | ((cube[:, 1] + _FAR) << 21) | (cube[:, 2] + _FAR)
+        place = np.searchsorted(self._known, key)
+        is_new = np.ones(len(key), dtype=bool)
+        inside = place < len(self._known)
+        is_new[inside] = self._known[place[inside]] != key[inside]
+        keys = np.unique(key[is_new])
+        at = np.searchsorted(self._known, keys)
+        self._row = np.insert(self._row, at, len(self._row) + np.arange(len(keys)))
+        self._known = np.insert(self._known, at, keys)
+        self._points.make_room(len(snapshot))
+        self._points.put(
+            fresh, cell=self._row[np.searchsorted(self._known, key)], reason=np.zeros(len(fresh), np.uint8)
         )
-        return Coverage(side, *empty, gap_mm2, np.nan)
-    side = float(np.median(strips.reach_mm[rows])) if cell_mm is None else cell_mm
-    cube = np.floor(snapshot.points_mm[rows] / side).astype(np.int64)
-    cube -= cube.min(axis=0)
-    extent = cube.max(axis=0) + 1
-    if float(np.prod(extent.astype(np.float64))) < 2.0**62:
-        key = (cube[:, 0] * extent[1] + cube[:, 1]) * extent[2] + cube[:, 2]
-        cell, count = np.unique(key, return_inverse=True, return_counts=True)[1:]
-    else:
-        cell, count = np.unique(cube, axis=0, return_inverse=True, return_counts=True)[1:]
-    cell = cell.reshape(-1)
-    cells = len(count)
+        self._cells.make_room(len(self._known))
+        self._count = len(snapshot)
 
-    def mean(values: Float64Array) -> Float64Array:
-        average: Float64Array = np.bincount(cell, weights=values, minlength=cells) / count
-        return average
+    def _measure(self, snapshot: MapSnapshot, report: RegionReport, renewed: IntArray) -> None:
+        """Add up anew the cells of points that were renewed, or whose reason is another."""
+        count, judgement = len(snapshot), report.judgement
+        cell = self._points.view("cell", count)
+        touched = np.zeros(len(self._row), dtype=bool)
+        touched[cell[renewed]] = True
+        touched[cell[self._points.view("reason", count) != report.reason]] = True
+        self._points.put(slice(count), reason=report.reason)
+        cells = np.flatnonzero(touched)
+        rows = np.flatnonzero(touched[cell] & judgement.judged)
+        place = np.zeros(len(touched), dtype=np.int64)
+        place[cells] = np.arange(len(cells))
+        own = place[cell[rows]]
+        points = np.bincount(own, minlength=len(cells))
 
-    stands_for = _surface_of_points(report)[rows]
-    passes = int(strips.group.max()) + 1
-    by_pass = np.bincount(cell * passes + strips.group[rows], weights=stands_for, minlength=cells * passes)
-    by_pass = by_pass.reshape(cells, passes)
-    area = (by_pass**2).sum(axis=1) / np.maximum(by_pass.sum(axis=1), 1e-300)
-    verdicts = len(Reason)
-    votes = np.bincount(cell * verdicts + report.reason[rows], weights=stands_for, minlength=cells * verdicts)
-    votes = votes.reshape(cells, verdicts)
-    meets = votes[:, [Reason.NONE, Reason.SHADOW]].sum(axis=1) >= 0.5 * votes.sum(axis=1)
-    whole = float(area.sum()) + gap_mm2
-    return Coverage(
-        cell_mm=side,
-        centre_mm=np.column_stack([mean(snapshot.points_mm[rows, k]) for k in range(3)]),
-        area_mm2=area,
-        density_per_mm2=mean(judgement.judged_per_mm2[rows]),
-        required_per_mm2=mean(judgement.required_per_mm2[rows]),
-        reason=votes.argmax(axis=1).astype(np.uint8),
-        meets=meets,
-        points=count.astype(np.int32),
-        gap_mm2=gap_mm2,
-        share=float(area[meets].sum()) / whole if whole > 0 else np.nan,
-    )
+        def mean(values: Float64Array) -> Float64Array:
+            total = np.bincount(own, weights=values, minlength=len(cells))
+            average: Float64Array = total / np.maximum(points, 1)
+            return average
+
+        stands_for = _surface_of_points(report, rows)
+        passes = int(report.spacings.group.max(initial=-1)) + 1
+        by_pass = _added_up(own, report.spacings.group[rows], stands_for, len(cells), passes)
+        votes = _added_up(own, report.reason[rows].astype(np.int64), stands_for, len(cells), len(Reason))
+        self._cells.put(
+            cells,
+            **{
+                "points": points.astype(np.int32),
+                "cell.centre_mm": np.column_stack([mean(snapshot.points_mm[rows, k]) for k in range(3)]),
+                "cell.area_mm2": (by_pass**2).sum(axis=1) / np.maximum(by_pass.sum(axis=1), 1e-300),
+                "cell.density_per_mm2": mean(judgement.judged_per_mm2[rows]),
+                "cell.required_per_mm2": mean(judgement.required_per_mm2[rows]),
+                "cell.reason": votes.argmax(axis=1).astype(np.uint8),
+                "cell.meets": votes[:, [Reason.NONE, Reason.SHADOW]].sum(axis=1) >= 0.5 * votes.sum(axis=1),
+            },
+        )
 
 
-def _surface_of_points(report: RegionReport) -> Float64Array:
-    """(n,) area each point stands for: half of each strip beside it by its spacing along the line.
+def _extent_mm(snapshot: MapSnapshot, first: int) -> float:
+    """How far along an axis the points from a row on lie from the first of the map."""
+    if first >= len(snapshot):
+        return 0.0
+    return float(np.abs(snapshot.points_mm[first:] - snapshot.points_mm[0]).max())
+
+
+def _added_up(cell: IntArray, kind: IntArray, values: Float64Array, cells: int, kinds: int) -> Float64Array:
+    """(cells, kinds) sums of values by cell and kind."""
+    total = np.bincount(cell * kinds + kind, weights=values, minlength=cells * kinds)
+    return np.asarray(total, dtype=np.float64).reshape(cells, kinds)
+
+
+def _surface_of_points(report: RegionReport, rows: IntArray) -> Float64Array:
+    """(k,) area each point stands for: half of each strip beside it by its spacing along the line.
 
     At a border of the part the one strip counts on both sides, where no strip is known the nominal line spacing.
     """
-    strips = report.strips
-    width = report.judgement.width_mm
+    strips = report.spacings
+    width = report.judgement.width_mm[rows]
     known = np.isfinite(width).sum(axis=1)
     total = np.where(np.isfinite(width), width, 0.0).sum(axis=1)
-    across = np.where(known > 0, total / np.maximum(known, 1), strips.line_spacing_mm)
-    along = strips.point_spacing_mm
-    return across * np.where(np.isfinite(along), along, strips.nominal_point_spacing_mm)
+    across = np.where(known > 0, total / np.maximum(known, 1), strips.line_spacing_mm[rows])
+    along = strips.point_spacing_mm[rows]
+    return across * np.where(np.isfinite(along), along, strips.nominal_point_spacing_mm[rows])

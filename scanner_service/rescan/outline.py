@@ -8,7 +8,6 @@ so that a single strand of a scanline has an area. Islets and pinholes smaller t
 count with their area, but have no loop.
 """
 
-import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,36 +33,6 @@ class Patch:
     area_mm2: float
     centroid_mm: Float64Array
     normal: Float64Array
-
-
-class Outlines:
-    """Outlines of patches, each drawn once as long as the same patch is asked for from round to round."""
-
-    def __init__(self) -> None:
-        self._drawn: dict[bytes, Patch] = {}
-        self._asked: dict[bytes, Patch] = {}
-
-    def new_round(self) -> None:
-        """Forget what the last round did not ask for."""
-        self._drawn, self._asked = self._asked, {}
-
-    def patch_of(
-        self,
-        points_mm: Float64Array,
-        connection_mm: Float64Array,
-        spacing_mm: Float64Array,
-        unfolded_mm: Float64Array | None = None,
-    ) -> Patch:
-        """As the function `patch_of` has it."""
-        of = [points_mm, connection_mm, spacing_mm, *([] if unfolded_mm is None else [unfolded_mm])]
-        digest = hashlib.blake2b(digest_size=16)
-        for array in of:
-            digest.update(np.ascontiguousarray(array).data)
-        key = digest.digest()
-        if key not in self._asked:
-            known = self._drawn.get(key)
-            self._asked[key] = patch_of(points_mm, connection_mm, spacing_mm, unfolded_mm) if known is None else known
-        return self._asked[key]
 
 
 def patch_of(

@@ -1,8 +1,12 @@
 """Connected patches of points that fail for one reason, each as a region; knows verdicts, takes none."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -12,8 +16,9 @@ from scanner_service.analysis.snapshot import Int32Array, MapSnapshot
 from scanner_service.rescan.frames import Frames
 from scanner_service.rescan.gaps import Fan, GapKind, Gaps
 from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason
-from scanner_service.rescan.outline import Outlines
-from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of, succession
+from scanner_service.rescan.kept import Kept
+from scanner_service.rescan.outline import patch_of
+from scanner_service.rescan.region import Limit, RescanRegion, mean_normal, priority_of, succession
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.stations import IntArray, Stations
 from scanner_service.rescan.strips import Strips
@@ -49,7 +54,7 @@ def patches(
     gaps: Gaps,
     judgement: Judgement,
     unfolded: Unfolded,
-    outlines: Outlines,
+    kept: Kept[RescanRegion],
     reason: Reason,
     noise_mm: float | None,
 ) -> tuple[list[RescanRegion], list[IntArray]]:
@@ -81,23 +86,35 @@ def patches(
     groups = np.split(rows[by_label], np.flatnonzero(np.diff(label[by_label])) + 1)
     np.maximum.at(connection, place[links[:, 0]], span)
     np.maximum.at(connection, place[links[:, 1]], span)
-    large = [
-        _region(
-            snapshot,
-            requirement,
-            strips,
-            judgement,
-            unfolded,
-            outlines,
-            reason,
-            group,
-            connection[place[group]],
-            noise_mm,
-        )
-        for group in groups
-        if len(group) >= requirement.region_points
-    ]
+    large = []
+    for group in groups:
+        if len(group) >= requirement.region_points:
+            reaches = connection[place[group]]
+            make = partial(
+                _region, snapshot, requirement, strips, judgement, unfolded, reason, group, reaches, noise_mm
+            )
+            large.append(kept.made(_made_of(snapshot, strips, judgement, unfolded, reason, group, reaches), make))
     return large, [group for group in groups if len(group) < requirement.region_points]
+
+
+def _made_of(
+    snapshot: MapSnapshot,
+    strips: Strips,
+    judgement: Judgement,
+    unfolded: Unfolded,
+    reason: Reason,
+    rows: IntArray,
+    connection_mm: Float64Array,
+) -> Iterator[npt.NDArray[Any]]:
+    """All that a region is made from and that may be other at the next verdict; points stay where they are."""
+    yield np.array([reason])
+    yield rows
+    yield connection_mm
+    yield snapshot.normals[rows]
+    yield unfolded.mm(rows)
+    for of in (strips, judgement):
+        for name in of.__slots__:
+            yield getattr(of, name)[rows]
 
 
 def _links(
@@ -165,7 +182,6 @@ def _region(
     strips: Strips,
     judgement: Judgement,
     unfolded: Unfolded,
-    outlines: Outlines,
     reason: Reason,
     rows: IntArray,
     connection_mm: Float64Array,
@@ -181,7 +197,7 @@ def _region(
     flat = np.concatenate([unfolded.mm(rows), 0.5 * (unfolded.mm(owner) + unfolded.mm(other))])
     connection = np.concatenate([connection_mm, connection_mm[np.searchsorted(rows, owner)]])
     spacing = np.fmin(strips.nominal_point_spacing_mm[np.concatenate([rows, owner])], connection)
-    patch = outlines.patch_of(points, connection, spacing, flat if one_pass else None)
+    patch = patch_of(points, connection, spacing, flat if one_pass else None)
     normal = mean_normal(snapshot.normals[rows])
     if np.isnan(normal).any():
         towards = snapshot.lines.laser_mm[snapshot.line[rows]].mean(axis=0) - patch.centroid_mm
@@ -219,9 +235,42 @@ def _region(
         point_count=len(rows),
         remedy=REMEDIES[reason],
         point_rows=rows,
+        limit=_limit(snapshot, requirement, strips, judgement, reason, rows, float(np.median(by_count)), limit),
         confidence=succession(int(_fails_alone(judgement, rows, values, required).sum()), len(rows)),
         line_spacing_mm=allowed,
     )
+
+
+def _limit(
+    snapshot: MapSnapshot,
+    requirement: Requirement,
+    strips: Strips,
+    judgement: Judgement,
+    reason: Reason,
+    rows: IntArray,
+    counted_per_mm2: float,
+    noise_limit_mm: float | None,
+) -> Limit | None:
+    """Which limit the patch misses; a strip that is too wide goes before what follows from it, the density."""
+    if reason is Reason.OUT_OF_RANGE:
+        return None
+    if reason is Reason.NOISY and noise_limit_mm is not None:
+        return Limit("noise", float(np.median(judgement.noise_mm[rows])), noise_limit_mm, "mm")
+    wide = rows[judgement.failing_strip[rows].any(axis=1)]
+    if 2 * len(wide) >= len(rows):
+        widest = np.where(judgement.failing_strip[wide], judgement.width_mm[wide], -np.inf).max(axis=1)
+        largest = np.fmin(judgement.allowed_mm[wide], strips.reach_mm[wide] if reason is Reason.STEEP else np.inf)
+        return Limit("line_spacing", float(np.median(widest)), float(np.median(largest)), "mm")
+    if reason is Reason.STEEP and requirement.incidence_rad is not None:
+        ray = snapshot.lines.laser_mm[snapshot.line[rows]] - snapshot.points_mm[rows]
+        cosine = np.einsum("ij,ij->i", ray, snapshot.normals[rows]) / np.linalg.norm(ray, axis=1)
+        known = np.abs(cosine[np.isfinite(cosine)])
+        leaning = float(np.arccos(np.clip(np.median(known), 0.0, 1.0))) if len(known) else 0.0
+        if leaning > requirement.incidence_rad:
+            return Limit("incidence", float(np.degrees(leaning)), float(np.degrees(requirement.incidence_rad)), "°")
+    by_spacing = float(np.fmin(np.median(judgement.spacing_per_mm2[rows]), np.inf))
+    density = min(counted_per_mm2, by_spacing)
+    return Limit("density", density, float(np.median(judgement.required_per_mm2[rows])), "points/mm²")
 
 
 def _fails_alone(judgement: Judgement, rows: IntArray, values: Float64Array, required: float) -> BoolArray:

@@ -47,7 +47,10 @@ _ROWS = ("chain", "link", "beside", "order")  # of strips: rows of the map
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """All that is measured and judged of the points of one map; arrays of their own, that a later renewal leaves."""
+    """All that is measured and judged of the points of one map; `strips` and `fan` are so until the next renewal only.
+
+    `rows` (k,) are the points that were judged again for it.
+    """
 
     stations: Stations
     frames: Frames
@@ -55,6 +58,7 @@ class Judged:
     fan: Fan
     gaps: Gaps
     judgement: Judgement
+    rows: IntArray
 
 
 class PointVerdicts:
@@ -98,12 +102,11 @@ class PointVerdicts:
         other = np.zeros(len(core), dtype=bool)
         other[snapshot.line[marks != self._columns.view("marks", len(snapshot))]] = True
         self._columns.put(slice(len(snapshot)), marks=marks)
-        self._judge(snapshot, stations, frames, core | _with_adjacent(stations, other, 1))
+        rows = self._judge(snapshot, stations, frames, core | _with_adjacent(stations, other, 1))
         everything = slice(len(snapshot))
-        return Judged(
-            stations, frames, self._strips(everything), self._fan(everything), gaps,
-            Judgement(**self._columns.copies("judgement", everything)),
-        )  # fmt: skip
+        strips, fan = Strips(**self._columns.views("strips", everything)), Fan(**self._columns.views("fan", everything))
+        judgement = Judgement(**self._columns.copies("judgement", everything))
+        return Judged(stations, frames, strips, fan, gaps, judgement, rows)
 
     def _is_another(self, snapshot: MapSnapshot, changed: IntArray) -> bool:
         """Whether the map is one that nothing is known of: points that counted do not any more, or the other way."""
@@ -181,9 +184,11 @@ class PointVerdicts:
         strips, fan = strips_of(excerpt, own_stations, frames, self._requirement), self._fan(rows)
         is_core = core[lines][excerpt.line]
         home = np.append(rows, -1)
-        values = {f"strips.{name}": getattr(strips, name)[is_core] for name in Strips.__slots__}
-        values |= {f"strips.{name}": home[values[f"strips.{name}"]] for name in _ROWS}
-        self._columns.put(rows[is_core], **values)
+        own = slice(None) if is_core.all() else is_core  # no copies of a whole map
+        values = {f"strips.{name}": getattr(strips, name)[own] for name in Strips.__slots__}
+        values |= {f"strips.{name}": home[values[f"strips.{name}"]].astype(np.int32) for name in _ROWS}
+        self._columns.put(rows[own], **values)
+        del values
         renewed = []
         for side, pairs in enumerate(find_pairs(excerpt, own_stations, frames, strips, fan, self._geometry)):
             kept = is_core[pairs.first] | is_core[pairs.second]
@@ -195,15 +200,13 @@ class PointVerdicts:
             nothing = np.zeros(int(is_core.sum()), dtype=np.uint8)
             self._columns.put(rows[is_core], **{f"kind.{side}": nothing})
             second = rows[pairs.second[kept]]
-            self._columns.put(
-                second,
-                **{
-                    f"kind.{side}": pairs.kind[kept],
-                    f"first.{side}": rows[pairs.first[kept]],
-                    f"is_down.{side}": pairs.is_down[kept],
-                    f"filled.{side}": np.zeros(len(second), dtype=bool),
-                },
-            )
+            found: dict[str, npt.NDArray[Any]] = {
+                f"kind.{side}": pairs.kind[kept],
+                f"first.{side}": rows[pairs.first[kept]].astype(np.int32),
+                f"is_down.{side}": pairs.is_down[kept],
+                f"filled.{side}": np.zeros(len(second), dtype=bool),
+            }
+            self._columns.put(second, **found)
             renewed.append(second)
         return renewed
 
@@ -245,8 +248,8 @@ class PointVerdicts:
         beyond = ~(inside(snapshot.points_mm[gaps.high]) | inside(snapshot.points_mm[gaps.low]))
         return replace(gaps, kind=np.where(beyond, np.uint8(GapKind.HOLE), gaps.kind))
 
-    def _judge(self, snapshot: MapSnapshot, stations: Stations, frames: Frames, lines_judged: BoolArray) -> None:
-        """Judge the points of some lines anew."""
+    def _judge(self, snapshot: MapSnapshot, stations: Stations, frames: Frames, lines_judged: BoolArray) -> IntArray:
+        """Judge the points of some lines anew; their rows."""
         around = _with_adjacent(stations, lines_judged, _HOPS)
         if self._looks_around(frames):
             own = _with_adjacent(stations, lines_judged, 1)
@@ -266,10 +269,13 @@ class PointVerdicts:
             self._noise_mm,
             self._asked,
         )
-        is_own = lines_judged[lines][excerpt.line]
+        is_own: BoolArray | slice = lines_judged[lines][excerpt.line]
+        if lines_judged[lines].all():
+            is_own = slice(None)
         self._columns.put(
             rows[is_own], **{f"judgement.{name}": getattr(found, name)[is_own] for name in Judgement.__slots__}
         )
+        return rows[is_own]
 
     def _looks_around(self, frames: Frames) -> bool:
         """Whether verdicts hang on points of lines that are neither adjacent nor under the same rays."""

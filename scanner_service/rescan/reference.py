@@ -203,7 +203,7 @@ def reference_coverage(
     radius = float(np.median(snapshot.radius_mm[counted])) if counted.any() else 1.0
     pieces = _inside(reference.pieces(radius), requirement.interest)
     good_point = report.judgement.judged & np.isin(report.reason, (Reason.NONE, Reason.SHADOW))
-    reach = max(0.6 * pieces.size_mm, float(np.quantile(report.strips.reach_mm, 0.9)) if len(snapshot) else 0.0)
+    reach = max(0.6 * pieces.size_mm, float(np.quantile(report.spacings.reach_mm, 0.9)) if len(snapshot) else 0.0)
     touched = _reached(pieces, snapshot, counted, reach)
     good = touched & _reached(pieces, snapshot, good_point, reach)
     untouched = _untouched(pieces, ~touched, requirement, radius)

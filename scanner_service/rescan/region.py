@@ -1,7 +1,9 @@
 """One rescan region as it is told: where, how large, why, how urgent and how far it has come; finds none."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +48,57 @@ class RegionMoment:
         }
 
 
+_SAID = {
+    "density": "density",
+    "line_spacing": "scanlines on the surface apart by",
+    "incidence": "incidence",
+    "noise": "noise",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """Which limit a region misses: `measured` against `required` in one unit, the latter the largest or the least.
+
+    `quantity` is `density` (points/mm²), `line_spacing` (mm), `incidence` (°) or `noise` (mm).
+    """
+
+    quantity: str
+    measured: float
+    required: float
+    unit: str
+
+    @property
+    def is_largest(self) -> bool:
+        """Whether more than `required` fails; less does, of a density."""
+        return self.quantity != "density"
+
+    @property
+    def text(self) -> str:
+        """For people: what was measured, and what is the most or the least."""
+        space, bound = "" if self.unit == "°" else " ", "at most" if self.is_largest else "at least"
+        measured, required = (f"{value:.3g}{space}{self.unit}" for value in (self.measured, self.required))
+        return f"{_SAID[self.quantity]} {measured}, {bound} {required}"
+
+    def to_dict(self) -> dict[str, object]:
+        """For JSON."""
+        return {
+            "quantity": self.quantity,
+            "measured": _known(self.measured),
+            "required": _known(self.required),
+            "unit": self.unit,
+            "bound": "at most" if self.is_largest else "at least",
+            "text": self.text,
+        }
+
+    @classmethod
+    def from_dict(cls, kept: Mapping[str, Any] | None) -> "Limit | None":
+        """As `to_dict` gave it; None where there is none."""
+        if kept is None or kept["measured"] is None or kept["required"] is None:
+            return None
+        return cls(str(kept["quantity"]), float(kept["measured"]), float(kept["required"]), str(kept["unit"]))
+
+
 @dataclass(frozen=True, slots=True)
 class RescanRegion:
     """A patch of surface worth another pass; part frame, millimetres.
@@ -61,7 +114,9 @@ class RescanRegion:
     `number` is the place in the list of one report; `region_id` names the region as long as the session lives (0: not
     followed, a report by itself). `confidence` = (agreeing + 1) / (points + 2): how many of its points fail by their
     own measurement, not by their neighbours' only. `line_spacing_mm` is the largest spacing on the surface that the
-    requirement allows there, NaN if unknown. `history` are the changes of its status, the oldest first.
+    requirement allows there, NaN if unknown. `limit` is what it fails by, None where nothing was measured (a shadow,
+    the end of the range, surface that nobody touched) or it is not known. `history` are the changes of its status, the
+    oldest first.
     """
 
     number: int
@@ -82,6 +137,7 @@ class RescanRegion:
     region_id: int = 0
     status: RegionStatus = RegionStatus.OPEN
     history: tuple[RegionMoment, ...] = ()
+    limit: Limit | None = None
 
     def __post_init__(self) -> None:
         for array in (*self.outline_mm, self.centroid_mm, self.normal, self.point_rows):
@@ -102,6 +158,7 @@ class RescanRegion:
             "required_per_mm2": _known(self.required_per_mm2),
             "counting_error_per_mm2": _known(self.counting_error_per_mm2),
             "line_spacing_mm": _known(self.line_spacing_mm),
+            "limit": None if self.limit is None else self.limit.to_dict(),
             "priority": self.priority,
             "confidence": self.confidence,
             "point_count": self.point_count,

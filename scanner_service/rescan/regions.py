@@ -8,14 +8,14 @@ from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
 from scanner_service.analysis.snapshot import MapSnapshot, UInt8Array
 from scanner_service.rescan.gaps import GapKind, Gaps, gap_lengths_mm
 from scanner_service.rescan.judgement import REMEDIES, Judgement, Reason
-from scanner_service.rescan.outline import Outlines
+from scanner_service.rescan.kept import Kept
 from scanner_service.rescan.patches import UPRIGHT, Unfolded, patches
 from scanner_service.rescan.points import PointVerdicts
 from scanner_service.rescan.region import RescanRegion, mean_normal, priority_of, succession
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.ribbons import Ribbon, shadow_ribbons
 from scanner_service.rescan.stations import IntArray
-from scanner_service.rescan.strips import Strips
+from scanner_service.rescan.strips import Spacings, Strips
 
 _SHARED = 1.0 / 3.0  # share of a ribbon's upper or lower ends that makes it part of a flank
 _FOOT = 4.0  # radii: how long the foot of a flank may be that has no gaps of its own
@@ -40,8 +40,8 @@ class RegionReport:
     any region (a patch smaller than the requirement asks). `counts` are points by verdict: `ok`, each reason,
     `unsettled`, `not_counted`, `requirement_unknown`, and `outside_interest` where there is a region of interest; they
     add up to n. `small_patches` are, by reason, the patches that are too small to be regions; the area of those with
-    fewer points than a region is taken from the nominal spacings. `judgement`, `strips` and `gaps` are what the report
-    was made from.
+    fewer points than a region is taken from the nominal spacings. `judgement`, `spacings` and `gaps` are what the
+    report was made from.
     """
 
     version: int
@@ -51,7 +51,7 @@ class RegionReport:
     counts: dict[str, int]
     small_patches: dict[str, SmallPatches]
     judgement: Judgement
-    strips: Strips
+    spacings: Spacings
     gaps: Gaps
 
     @property
@@ -93,7 +93,8 @@ class RegionFinder:
         self._requirement = requirement or Requirement()
         self._noise_mm = noise_mm
         self._points = PointVerdicts(self._requirement, geometry, noise_mm, towards_sensor)
-        self._outlines = Outlines()
+        self._kept: Kept[RescanRegion] = Kept()
+        self.renewed: IntArray = np.zeros(0, dtype=np.int64)  # rows that were measured and judged again at last
 
     def find(self, snapshot: MapSnapshot, changed: IntArray | None = None) -> RegionReport:
         """Find what is worth another pass.
@@ -104,7 +105,8 @@ class RegionFinder:
         changed : (k,) rows of it that are new or other than when regions were found last; None: any may be.
         """
         points = self._points.renew(snapshot, changed)
-        self._outlines.new_round()
+        self.renewed = points.rows
+        self._kept.new_round()
         requirement, strips = self._requirement, points.strips
         ribbons = shadow_ribbons(snapshot, requirement, strips, points.gaps)
         ribbons, gaps, judgement = _flanks_completed(snapshot, ribbons, strips, points.gaps, points.judgement)
@@ -114,7 +116,7 @@ class RegionFinder:
         for reason in Reason:
             if reason not in (Reason.NONE, Reason.SHADOW):
                 large, few = patches(
-                    snapshot, requirement, strips, gaps, judgement, unfolded, self._outlines, reason, self._noise_mm
+                    snapshot, requirement, strips, gaps, judgement, unfolded, self._kept, reason, self._noise_mm
                 )
                 drafts += large
                 small += [(reason, len(rows), _nominal_area(strips, rows)) for rows in few]
@@ -139,7 +141,7 @@ class RegionFinder:
             counts=_counts(snapshot, judgement, requirement),
             small_patches=_by_reason(small),
             judgement=judgement,
-            strips=strips,
+            spacings=Spacings(**{name: getattr(strips, name).copy() for name in Spacings.__slots__}),
             gaps=gaps,
         )
 

@@ -85,7 +85,7 @@ def stations_of(lines: LineTable) -> Stations:
     return Stations(group, rank, adjacent, gap, missing, stride, _point_spacing(lines, group))
 
 
-def _rises(along: Float64Array) -> bool:
+def _rises(along: Float64Array | IntArray) -> bool:
     """Whether the first two different values rise: lines that follow in the same direction then change no rank."""
     other = np.flatnonzero(along != along[0]) if len(along) else np.zeros(0, dtype=np.int64)
     return not len(other) or bool(along[other[0]] > along[0])

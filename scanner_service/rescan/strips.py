@@ -52,6 +52,21 @@ class Strips:
             read_only(getattr(self, name))
 
 
+@dataclass(frozen=True, slots=True)
+class Spacings:
+    """What strips say of the scanlines around each point; arrays of n rows, as in `Strips`."""
+
+    point_spacing_mm: Float64Array
+    line_spacing_mm: Float64Array
+    nominal_point_spacing_mm: Float64Array
+    reach_mm: Float64Array
+    group: IntArray
+
+    def __post_init__(self) -> None:
+        for name in self.__slots__:
+            read_only(getattr(self, name))
+
+
 def strips_of(snapshot: MapSnapshot, stations: Stations, frames: Frames, requirement: Requirement) -> Strips:
     """Measure the strips on both sides of every counted point."""
     lines, line = snapshot.lines, snapshot.line

@@ -15,6 +15,7 @@ import numpy as np
 from drivers.scanline import SensorGeometry
 from scanner_service.analysis.live_map import LiveMap
 from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.rescan.coverage import Coverage, CoverageBook
 from scanner_service.rescan.followed import Change, RegionBook
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.rescan.regions import RegionFinder, RegionReport
@@ -71,6 +72,7 @@ class Judgement:
         self._in_force = threading.Lock()  # of the regions and the results
         self._mirror = Mirror()
         self._finder: RegionFinder | None = None
+        self._coverage = CoverageBook()
         self._seen_from: tuple[object, ...] = ()  # what the finder judges by
         self._mirroring = threading.Lock()
 
@@ -111,9 +113,10 @@ class Judgement:
             with self._mirroring:
                 read_s = self._now_s()
                 self._mirror.catch_up(self._ask, self._ask_between)
-                snapshot, changed = self._mirror.snapshot(), self._mirror.take_changed()
-            report = self._find_regions(snapshot, changed.astype(np.int64), source)
-            found = conclude(snapshot, self._requirement, report, self._nominal.surface, self._nominal.refused)
+                snapshot, changed = self._mirror.changes()
+            report, coverage = self._found_again(snapshot, changed, source)
+            nominal = self._nominal
+            found = conclude(snapshot, self._requirement, report, coverage, nominal.surface, nominal.refused)
             with self._in_force:
                 results, changes = self._follow(found)
             self._tell(changes)
@@ -127,15 +130,17 @@ class Judgement:
             self._read_s = read_s
         return results
 
-    def _find_regions(self, snapshot: MapSnapshot, changed: IntArray, source: Source) -> RegionReport:
-        """The regions of the map, of which these rows have changed; found from nothing when it is seen otherwise."""
+    def _found_again(self, snapshot: MapSnapshot, changed: IntArray, source: Source) -> tuple[RegionReport, Coverage]:
+        """Regions and coverage of the map, of which these rows have changed; from nothing when it is seen otherwise."""
         towards = source.towards_sensor
         seen_from = _values_of(source.geometry), None if towards is None else tuple(towards.tolist())
         if self._finder is None or seen_from != self._seen_from:
             self._finder = RegionFinder(self._requirement, source.geometry, towards_sensor=towards)
+            self._coverage = CoverageBook()
             self._seen_from = seen_from
         try:
-            return self._finder.find(snapshot, changed)
+            report = self._finder.find(snapshot, changed)
+            return report, self._coverage.renew(snapshot, report, self._finder.renewed)
         except BaseException:
             self._finder = None  # what it knows is half renewed
             raise

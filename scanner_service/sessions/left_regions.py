@@ -13,7 +13,7 @@ import numpy as np
 
 from scanner_service.rescan.followed import RegionBook
 from scanner_service.rescan.judgement import Reason
-from scanner_service.rescan.region import RescanRegion
+from scanner_service.rescan.region import Limit, RescanRegion
 from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.results import Results
 from scanner_service.storage.rows import EventRow
@@ -134,4 +134,5 @@ def _read(kept: Mapping[str, Any]) -> RescanRegion:
         confidence=float(kept["confidence"]),
         line_spacing_mm=number("line_spacing_mm"),
         region_id=int(kept["id"]),
+        limit=Limit.from_dict(kept.get("limit")),
     )

@@ -5,20 +5,24 @@ what changed, a page at a time between scanlines; all further work is done on th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from scanner_service.analysis.describing import Records
 from scanner_service.analysis.live_map import LiveMap
-from scanner_service.analysis.points import POINT, PointArray, put_points
 from scanner_service.analysis.snapshot import Int32Array, MapSnapshot
+from scanner_service.rescan.columns import Columns
 
 T = TypeVar("T")
 PAGE_ROWS = 50_000
 """The engine copies so many rows between two scanlines, in some two milliseconds."""
+
+
+_COLUMNS = [item.name for item in fields(MapSnapshot) if item.name not in ("version", "origin_mm", "lines")]
 
 
 class Ask(Protocol):
@@ -41,17 +45,15 @@ class _News:
 class Mirror:
     """A copy of one live map; one thread owns it.
 
-    It holds the map's records as they are: a row is described once for each snapshot that somebody wants, not each
-    time it changes.
+    It holds what a snapshot says of every point; rows are described as they come, on the thread that reads.
     """
 
     def __init__(self) -> None:
         self.version = 0
-        self._points: PointArray = np.empty(0, dtype=POINT)
-        self._place: Int32Array = np.empty(0, dtype=np.int32)
         self._total = 0
-        self._latest: Records | None = None
+        self._latest: MapSnapshot | None = None
         self._changed: list[Int32Array] = []
+        self._described = Columns()
 
     def catch_up(self, ask: Ask, ask_between: Ask) -> int:
         """Take in everything that the engine was given before this call; returns how many rows were copied.
@@ -62,7 +64,7 @@ class Mirror:
         copied = 0
         while True:
             news = ask(partial(_news_since, version=self.version))
-            self._make_room(news.total)
+            self._described.make_room(news.total)
             copied += len(news.rows)
             self._changed.append(news.rows)
             if news.records is not None:
@@ -76,28 +78,21 @@ class Mirror:
 
     def snapshot(self) -> MapSnapshot:
         """The whole map as it was caught up with last, frozen; what is copied later does not change it."""
+        return self.changes()[0]
+
+    def changes(self) -> tuple[MapSnapshot, npt.NDArray[np.int64]]:
+        """The same, and its rows (k,), rising, that are new or other than in the snapshot before."""
         assert self._latest is not None
-        whole = slice(0, self._total)
-        return replace(self._latest, points=self._points[whole].copy(), place=self._place[whole].copy()).describe()
-
-    def take_changed(self) -> Int32Array:
-        """The rows (k,) of the snapshot, rising, that are new or other than when this was asked last; once each."""
         is_in = np.zeros(self._total, dtype=np.bool_)
-        for rows in self._changed:
-            is_in[rows] = True
+        for part in self._changed:
+            is_in[part] = True
         self._changed.clear()
-        return np.flatnonzero(is_in).astype(np.int32)
-
-    def _make_room(self, total: int) -> None:
-        """Room for so many rows, and for half as many more, so that a growing map is not copied every time."""
-        if total > len(self._points):
-            more = total + total // 2 - len(self._points)
-            self._points = np.concatenate([self._points, np.empty(more, dtype=POINT)])
-            self._place = np.concatenate([self._place, np.empty(more, dtype=np.int32)])
+        points: dict[str, Any] = self._described.copies("point", slice(self._total))
+        return replace(self._latest, **points), np.flatnonzero(is_in).astype(np.int64)
 
     def _put(self, rows: Int32Array, records: Records) -> None:
-        put_points(self._points, self._place, rows, records.points, records.place)
-        self._latest = records
+        self._latest = news = records.describe()
+        self._described.put(rows.astype(np.int64), **{f"point.{name}": getattr(news, name) for name in _COLUMNS})
 
 
 def _news_since(live_map: LiveMap, version: int) -> _News:

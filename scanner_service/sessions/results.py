@@ -106,17 +106,18 @@ def judge(
     `reference_refused` says why there is no reference although one was asked for.
     """
     report = find_regions(snapshot, requirement, geometry, towards_sensor=towards_sensor)
-    return conclude(snapshot, requirement, report, reference, reference_refused)
+    return conclude(snapshot, requirement, report, observed_coverage(snapshot, report), reference, reference_refused)
 
 
 def conclude(
     snapshot: MapSnapshot,
     requirement: Requirement,
     report: RegionReport,
+    coverage: Coverage,
     reference: ReferenceSurface | None = None,
     reference_refused: str | None = None,
 ) -> Results:
-    """The results of a snapshot whose regions have been found."""
+    """The results of a snapshot whose regions and coverage are known."""
     measured, refused = None, reference_refused
     if reference is not None:
         try:
@@ -128,7 +129,7 @@ def conclude(
     return Results(
         snapshot=snapshot,
         report=report,
-        coverage=observed_coverage(snapshot, report),
+        coverage=coverage,
         requirement=requirement,
         regions=tuple(replace(region, number=number) for number, region in enumerate(regions, start=1)),
         reference=measured,

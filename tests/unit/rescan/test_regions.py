@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from scanner_service.rescan.judgement import Reason
+from scanner_service.rescan.region import Limit
 from scanner_service.rescan.regions import RegionReport, find_regions
 from scanner_service.rescan.requirement import Requirement
 from tests.unit.rescan.synthetic_scan import Height, Scan, snapshot_of, straight_down
@@ -88,6 +89,36 @@ def test_a_plane_beyond_the_limit_is_one_steep_region_of_its_true_area(degrees: 
     np.testing.assert_allclose(report.regions[0].normal, expected, atol=0.02)
     # the spacing on the surface is what ranks: 1 / (line spacing / cos * point spacing)
     assert report.regions[0].measured_per_mm2 == pytest.approx(np.cos(np.radians(degrees)) / 0.3 / 0.15, rel=0.05)
+
+
+@pytest.mark.parametrize("degrees", [57.0, 65.0, 75.0])
+def test_a_tilt_is_measured_where_the_radius_of_the_rule_reaches_no_second_line(degrees: float) -> None:
+    snapshot = snapshot_of(straight_down(tilted(degrees), X, Y, 0.3))
+    assert not snapshot.reliable.any(), "the neighbourhood is a single scanline, whose plane would be the laser's"
+    nominal = np.median(snapshot.density_per_mm2) * 0.3 * 0.15
+    assert nominal == pytest.approx(2 * 0.3 / (np.pi * 0.524), rel=0.1), "... and its density the same at any tilt"
+    region = find_regions(snapshot).regions[0]
+    assert region.reason is Reason.STEEP and region.limit is not None
+    assert region.limit.quantity == "line_spacing" and region.limit.unit == "mm"
+    assert region.limit.measured == pytest.approx(0.3 / np.cos(np.radians(degrees)), rel=0.02)
+    assert region.limit.required == pytest.approx(np.sqrt(2.0) * 0.3 + 0.1)
+
+
+def test_what_a_region_fails_by_is_told_with_its_unit_and_which_way_it_fails() -> None:
+    steep = find_regions(snapshot_of(straight_down(tilted(60.0), X, Y, 0.3))).regions[0]
+    assert steep.to_dict()["limit"] == {
+        "quantity": "line_spacing",
+        "measured": pytest.approx(0.6, rel=0.01),
+        "required": pytest.approx(0.524, rel=0.01),
+        "unit": "mm",
+        "bound": "at most",
+        "text": "scanlines on the surface apart by 0.6 mm, at most 0.524 mm",
+    }
+    sparse = find_regions(snapshot_of(straight_down(flat, X, Y, 0.3)), Requirement(density_per_mm2=60.0)).regions[0]
+    assert sparse.limit is not None and Limit.from_dict(sparse.limit.to_dict()) == sparse.limit
+    leaning = Requirement(incidence_rad=np.radians(30.0))
+    turned = find_regions(snapshot_of(straight_down(tilted(45.0), X, Y, 0.3)), leaning).regions[0]
+    assert turned.limit is not None and turned.limit.text == "incidence 45°, at most 30°"
 
 
 @pytest.mark.parametrize("degrees", [20.0, 45.0, 53.0])
