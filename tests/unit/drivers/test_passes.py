@@ -174,7 +174,9 @@ def test_a_spacing_that_a_conveyor_cannot_give_is_refused_with_the_one_that_it_g
     assert sum(isinstance(event, Scanline) for event in drive.told.take(0.0)) < 10
 
 
-@pytest.mark.parametrize(("spacing_mm", "is_told"), [(0.1, True), (0.3, False), (0.5, False), (0.9, False), (1.5, True)])
+@pytest.mark.parametrize(
+    ("spacing_mm", "is_told"), [(0.1, True), (0.3, False), (0.5, False), (0.9, False), (1.5, True)]
+)
 def test_lines_that_come_farther_apart_or_closer_than_ordered_are_taken_and_told(spacing_mm, is_told):
     scanner, drive = on_a_conveyor(spacing_mm)
     MotionPass(drive, scanner).run()
