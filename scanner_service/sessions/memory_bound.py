@@ -5,7 +5,7 @@ from pathlib import Path
 FIXED_BYTES = 300 << 20
 """What the program takes without any point."""
 
-BYTES_A_POINT = 560
+BYTES_A_POINT = 760
 """What a point takes at the worst moment: while the whole map is judged. In slabs it is about 150."""
 
 MOST_POINTS, LEAST_POINTS = 10_000_000, 200_000

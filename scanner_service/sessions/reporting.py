@@ -148,8 +148,13 @@ def _losses(losses: Mapping[str, Any]) -> tuple[tuple[str, tuple[tuple[str, str]
 
 def _rows_of_passes(passes: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
     """Lines, and chunks where there are any, of each pass, then of all of them."""
+    boots = {device: {told["boot_id"] for told in passes if told["device_id"] == device} for device in
+             {told["device_id"] for told in passes}}  # fmt: skip
     for told in passes:
-        yield from _rows_of_pass(f"{told['device_id']} pass {told['pass_index']}", told["lines"], told["chunks"])
+        name = f"{told['device_id']} pass {told['pass_index']}"
+        if len(boots[told["device_id"]]) > 1:  # each boot counts its passes anew
+            name += f", boot {told['boot_id']}"
+        yield from _rows_of_pass(name, told["lines"], told["chunks"])
     if len(passes) > 1:
         lines, chunks = (reduce(joined, [told[of] for told in passes]) for of in ("lines", "chunks"))
         yield from _rows_of_pass("all passes", lines, chunks)

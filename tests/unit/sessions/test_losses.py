@@ -122,6 +122,7 @@ def test_the_scanner_s_losses_are_those_of_all_passes_also_after_a_restart(tmp_p
     with closing(RecordReader.open(tmp_path / "r")) as reader:
         content = report_of(read_session(reader, reader.get_session(session_id), with_stages=True), datetime.now(UTC))
     told = dict(dict(content.losses)["Scanlines of each pass, from the scanner to the record"])
+    assert told["A pass 0, boot 2"] == "6 sent, 5 stored; lost: 1 missing"
     assert told["all passes"] == "12 sent, 10 stored; lost: 2 missing"
     assert dict(dict(content.losses)["Scanner and wire, all passes"])["lines · sent"] == "12"
 
