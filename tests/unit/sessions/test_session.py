@@ -6,12 +6,7 @@ from pathlib import Path
 
 import pytest
 
-<<<<<<< HEAD
-=======
-from drivers.rig import Rig
-from drivers.scanline import DeviceInfo, SensorGeometry
 from scanner_service.rescan.requirement import Requirement, RequirementUnusable
->>>>>>> ecffe94 (viewer: what is asked for as a form; regions called by one number everywhere; a hand is guided)
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SessionBusy, SourceUnusable
 from scanner_service.sessions.settings import SessionSettings
