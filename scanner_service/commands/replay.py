@@ -16,9 +16,9 @@ from scanner_service.commands.terminal import (
     errors,
     loss_sentence,
     plain_errors,
-    regions_table,
     scan_progress,
     show_json,
+    tell_regions,
 )
 from scanner_service.rescan.presets import requirement_of
 from scanner_service.rescan.reference import ReferenceSurface
@@ -90,10 +90,10 @@ def replay_command(
                 source, origin_mm = spec.open(recording), (0.0, 0.0, 0.0)
                 settings = SessionSettings(
                     point_spacing_mm=0.0 if plain_radius else _known(recording.point_spacing_mm),
-                    density_per_mm2=density,
                     noise_mm=noise or 0.0,
                     target=requirement_of(
                         preset,
+                        density_per_mm2=density,
                         line_spacing_mm=surface_spacing,
                         chord_error_mm=chord_error,
                         incidence_rad=None if incidence is None else math.radians(incidence),
@@ -144,7 +144,7 @@ def _facts(session: LiveSession) -> dict[str, Any]:
 
 def tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
     """Print the regions as a table, and what the scan came to."""
-    console.print(regions_table(regions, "Rescan regions"))
+    tell_regions(regions)
     share, held = summary["coverage"]["share"], summary["coverage"]["holds"]
     nominal = summary["coverage"]["kind"] == "reference"
     console.print(

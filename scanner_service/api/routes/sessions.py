@@ -19,20 +19,24 @@ from scanner_service.api.schemas import (
     DeviceSourceIn,
     PassIn,
     PushSourceIn,
+    ReferenceIn,
     ReplaySourceIn,
+    RequirementIn,
     RigSourceIn,
     SessionIn,
+    requirement_told,
 )
 from scanner_service.api.scopes import require
 from scanner_service.rescan.presets import PRESETS
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SourceUnusable
-from scanner_service.sessions.references import open_reference
+from scanner_service.sessions.references import NO_NOMINAL, Nominal, open_reference
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec, ReplaySpec, RigSpec, SourceSpec
 from scanner_service.storage.database import is_sqlite
 from scanner_service.storage.formats.recording import ReadOptions
+from scanner_service.storage.formats.reference_mesh import ReferenceSpec
 from scanner_service.storage.rows import SessionRow
 
 router = APIRouter(prefix="/api/v1/sessions", tags=["sessions"])
@@ -120,6 +124,8 @@ def status_answer(session: LiveSession) -> dict[str, Any]:
         "calibration": session.row.calibration,
         "held": status.held,
         "can_pause": session.can_pause,
+        "requirement": requirement_told(session.settings.target),
+        "holds": status.holds,
     }
 
 
@@ -146,7 +152,7 @@ def list_sessions(
 @router.get("/presets", dependencies=[viewer])
 def list_presets() -> Response:
     """Requirements by name, from the loosest to the finest; null is what is not asked for."""
-    return answer({"presets": {name: preset.to_dict() for name, preset in PRESETS.items()}})
+    return answer({"presets": {name: requirement_told(preset) for name, preset in PRESETS.items()}})
 
 
 @router.post("", status_code=201)
@@ -199,6 +205,48 @@ def describe_session(request: Request, session_id: str, body: DescriptionIn) -> 
     """Change the name or the notes of a session."""
     row = book_of(request).describe(session_id, name=body.name, notes=body.notes)
     return answer(row_answer(book_of(request), row))
+
+
+@router.get("/{session_id}/requirement", dependencies=[viewer])
+def get_requirement(session: Session) -> Response:
+    """What the session is judged by, and whether the coverage asked for is reached."""
+    return answer(_requirement_answer(session))
+
+
+@router.put("/{session_id}/requirement", dependencies=[operator])
+def put_requirement(session: Session, body: RequirementIn) -> Response:
+    """Ask for something else, in the place of all that was asked for; the answer comes when all is judged anew.
+
+    It may be sent before, during and after a scan, and stays with the session; that it changed is an event.
+    """
+    session.judge_by(body.to_requirement())
+    return answer(_requirement_answer(session))
+
+
+@router.put("/{session_id}/reference", dependencies=[operator])
+def put_reference(request: Request, session: Session, body: ReferenceIn) -> Response:
+    """Measure coverage against a nominal part in the replay folder; the answer comes when all is judged anew."""
+    surface, spec = open_reference(ReferenceSpec(body.file, body.units), request.app.state.service.replay_dir)
+    session.measure_against(spec, Nominal(surface))
+    return answer(_requirement_answer(session))
+
+
+@router.delete("/{session_id}/reference", dependencies=[operator])
+def delete_reference(session: Session) -> Response:
+    """Measure coverage against the surface seen again."""
+    session.measure_against(None, NO_NOMINAL)
+    return answer(_requirement_answer(session))
+
+
+def _requirement_answer(session: LiveSession) -> dict[str, Any]:
+    status = session.status()
+    return {
+        "requirement": requirement_told(session.settings.target),
+        "reference": session.row.settings.get("reference"),
+        "holds": status.holds,
+        "coverage": status.coverage,
+        "coverage_kind": status.coverage_kind,
+    }
 
 
 @router.post("/{session_id}/open", status_code=202, dependencies=[operator])
