@@ -1,50 +1,71 @@
-"""The composition root of the command line: which commands there are; the bare command serves."""
+"""The composition root of the command line: which commands there are; the bare command serves.
 
+A command is imported when it is asked for: the libraries of all of them together take 70 MB and a second.
+"""
+
+import importlib
 import os
 from pathlib import Path
 from typing import Annotated
 
+import click
 import typer
+from typer.core import TyperGroup
 
 from scanner_service import __version__
-from scanner_service.commands.analyse import analyse_command
-from scanner_service.commands.bench import bench_app
-from scanner_service.commands.compare import compare_command
-from scanner_service.commands.demo import demo_command
-from scanner_service.commands.devices import devices_command, doctor_command
-from scanner_service.commands.export import export_command, verify_command
-from scanner_service.commands.open_viewer import open_command
-from scanner_service.commands.replay import replay_command
-from scanner_service.commands.report import report_command
-from scanner_service.commands.rescan import rescan_command
-from scanner_service.commands.scan import scan_command
-from scanner_service.commands.serve import DEFAULT_DATA, serve_command
-from scanner_service.commands.sessions import sessions_app
-from scanner_service.commands.simulate import simulate_command
+
+COMMANDS = {
+    "serve": "serve:serve_command",
+    "open": "open_viewer:open_command",
+    "demo": "demo:demo_command",
+    "scan": "scan:scan_command",
+    "devices": "devices:devices_command",
+    "doctor": "devices:doctor_command",
+    "replay": "replay:replay_command",
+    "analyse": "analyse:analyse_command",
+    "rescan": "rescan:rescan_command",
+    "compare": "compare:compare_command",
+    "export": "export:export_command",
+    "report": "report:report_command",
+    "verify": "export:verify_command",
+    "simulate": "simulate:simulate_command",
+    "sessions": "sessions:sessions_app",
+    "bench": "bench:bench_app",
+}
+"""Each command's file in `commands`, and its function there, or its application where it has commands of its own."""
+
+
+class CommandsWhenAsked(TyperGroup):
+    """The commands of COMMANDS, in that order, each imported when somebody asks for it."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """The names of all commands."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of that name, or None."""
+        if cmd_name not in COMMANDS:
+            return None
+        module, name = COMMANDS[cmd_name].split(":")
+        found = getattr(importlib.import_module(f"scanner_service.commands.{module}"), name)
+        if isinstance(found, typer.Typer):
+            command = typer.main.get_group(found)
+        else:
+            alone = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
+            alone.command(cmd_name)(found)
+            command = typer.main.get_command(alone)
+        command.name = cmd_name
+        return command
+
 
 app = typer.Typer(
     name="scanner",
+    cls=CommandsWhenAsked,
     help="Live quality for laser-line scanning: density, normals, and what to scan again.",
     no_args_is_help=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-app.command("serve")(serve_command)
-app.command("open")(open_command)
-app.command("demo")(demo_command)
-app.command("scan")(scan_command)
-app.command("devices")(devices_command)
-app.command("doctor")(doctor_command)
-app.command("replay")(replay_command)
-app.command("analyse")(analyse_command)
-app.command("rescan")(rescan_command)
-app.command("compare")(compare_command)
-app.command("export")(export_command)
-app.command("report")(report_command)
-app.command("verify")(verify_command)
-app.command("simulate")(simulate_command)
-app.add_typer(sessions_app, name="sessions")
-app.add_typer(bench_app, name="bench")
 
 
 def _tell_version(wanted: bool) -> None:
@@ -62,8 +83,9 @@ def bare(
 ) -> None:
     """Without a command: serve with the defaults."""
     if context.invoked_subcommand is None:
-        serve_command(
-            Path(os.environ.get("SCANNER_DATA") or DEFAULT_DATA), record=os.environ.get("SCANNER_RECORD") or None
+        serve = importlib.import_module("scanner_service.commands.serve")
+        serve.serve_command(
+            Path(os.environ.get("SCANNER_DATA") or serve.DEFAULT_DATA), record=os.environ.get("SCANNER_RECORD") or None
         )
 
 

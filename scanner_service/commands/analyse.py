@@ -1,5 +1,6 @@
 """`scanner analyse`: density and normals of a plain cloud that has no scanlines."""
 
+import importlib
 import math
 from pathlib import Path
 from typing import Annotated, cast, get_args
@@ -17,9 +18,9 @@ from scanner_service.commands.clouds import open_points
 from scanner_service.commands.compiling_apart import compile_apart
 from scanner_service.commands.options import parse_position, parse_units
 from scanner_service.commands.orienting import orient_snapshot
+from scanner_service.commands.small_memory import give_memory_back
 from scanner_service.commands.terminal import check_folder, console, errors, plain_errors, show_json
 from scanner_service.sessions.results import summarise_cloud
-from scanner_service.storage.exports.density_png import density_png
 from scanner_service.storage.exports.points_ply import write_points_ply
 from scanner_service.storage.exports.results_json import write_json
 from scanner_service.storage.exports.whole_file import write_whole
@@ -51,6 +52,7 @@ def analyse_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Analyse a cloud with a given radius or one of the chapter's rules, and write the result files."""
+    give_memory_back()
     with plain_errors():
         if orient and seen_from is not None:
             raise ValueError("--seen-from tells the side of each normal, --orient finds it: leave one of them out")
@@ -101,7 +103,8 @@ def analyse_command(
             rescan = (snapshot.density_per_mm2 < density) & (snapshot.unreliable != Unreliable.NOT_COUNTED)
             summary["below_required"] = int(rescan.sum())
         write_points_ply(out / "points.ply", snapshot, rescan, version=__version__)
-        write_whole(out / "density.png", density_png(snapshot, session_name=file.name))
+        drawing = importlib.import_module("scanner_service.storage.exports.density_png")  # 40 MB that no method needs
+        write_whole(out / "density.png", drawing.density_png(snapshot, session_name=file.name))
         write_json(out / "regions.json", {"regions": [], "notes": [NO_REGIONS]})
         write_json(out / "summary.json", summary)
         if as_json:

@@ -19,7 +19,9 @@ from scanner_service.analysis.comparison.running import Meter, Row, compare, our
 from scanner_service.analysis.comparison.shapes import CUSTOMARY, SHAPES, KnownCloud, known_cloud
 from scanner_service.analysis.normals.estimating import METHODS
 from scanner_service.commands.clouds import open_points
+from scanner_service.commands.compiling_apart import compile_apart
 from scanner_service.commands.measuring import measured
+from scanner_service.commands.small_memory import give_memory_back
 from scanner_service.commands.terminal import check_folder, console, errors, plain_errors, show_json
 from scanner_service.storage.exports.comparison_png import comparison_png
 from scanner_service.storage.exports.results_json import write_json
@@ -47,12 +49,15 @@ def compare_command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
 ) -> None:
     """Add noise to clouds whose normals are known, run every method, and print and save a table and a picture."""
+    give_memory_back()
     with plain_errors():
         levels = _levels(noise)
         names = _known(method, tuple(METHODS), "method")
         rng = np.random.default_rng(seed)
         clouds = _clouds(files or [], _known(shape, tuple(SHAPES), "shape"), points, units, rng)
         check_folder(out)
+        for name in METHODS if names is None else names:
+            compile_apart(name, max(len(cloud.points_mm) for cloud in clouds))
         contestants = our_methods(names)
         if with_peers:
             outside, notes = peers(min(len(cloud.points_mm) for cloud in clouds))

@@ -4,6 +4,7 @@ Both are tried at many settings, of which the best one counts: they are told wha
 """
 
 import importlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -43,14 +44,37 @@ def peers(points: int) -> tuple[list[Contestant], list[str]]:
     except ImportError:
         return found, ["Open3D is not installed, so it is left out: install scanner-service[bench] to have it"]
 
-    def theirs(count: int) -> Estimator:
-        return lambda cloud: _open3d_normals(open3d, cloud, count)
-
-    found.append(Contestant("open3d_best", {f"k={count}": theirs(count) for count in counts}))
+    found.append(Contestant("open3d_best", _open3d_settings(open3d, counts)))
     return found, []
 
 
-def _open3d_normals(open3d: Any, points_mm: Float64Array, count: int) -> Float64Array:
+def _open3d_settings(open3d: Any, counts: list[int]) -> dict[str, Estimator]:
+    """Each of its searches: by number, within a radius, and at most so many within a radius.
+
+    Radii are median distances to a number of neighbours, so that they are tried as finely as the numbers.
+    """
+    search = open3d.geometry
+
+    def by(make: Callable[[float], Any], count: int) -> Estimator:
+        return lambda cloud: _open3d_normals(open3d, cloud, make(reach_mm(cloud, count)))
+
+    settings = {f"k={count}": by(lambda _, k=count: search.KDTreeSearchParamKNN(k), count) for count in counts}
+    for count in counts[::2]:
+        settings[f"radius of {count}"] = by(search.KDTreeSearchParamRadius, count)
+        settings[f"at most {count} within the radius of {count}"] = by(
+            lambda radius, k=count: search.KDTreeSearchParamHybrid(radius, k), count
+        )
+    return settings
+
+
+def reach_mm(points_mm: Float64Array, count: int) -> float:
+    """Median distance in mm of up to 2,000 of the points (n, 3) to the `count`-th nearest, itself counted."""
+    some = points_mm[:: max(1, len(points_mm) // 2000)]
+    return float(np.median(np.asarray(cKDTree(points_mm).query(some, k=[min(count, len(points_mm))])[0])))
+
+
+def _open3d_normals(open3d: Any, points_mm: Float64Array, search: Any) -> Float64Array:
+    """Normals (n, 3); a point with fewer than three neighbours gets +z from Open3D, and keeps it."""
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points_mm.copy()))
-    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(count))
+    cloud.estimate_normals(search)
     return np.asarray(cloud.normals).copy()

@@ -53,7 +53,7 @@ def _boruvka(
 ) -> None:
     n = len(group)
     lightest = np.empty(n, dtype=np.int32)
-    living = np.arange(len(tail)).astype(np.int32)
+    living = np.arange(len(tail), dtype=np.int32)
     count = len(tail)
     while count > 0:
         lightest[:] = -1

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from drivers.scanline import Float64Array
 from scanner_service.analysis.errors import MethodRefused
-from scanner_service.analysis.normals.choosing_count import Deals, Reference
+from scanner_service.analysis.normals.choosing_count import Judge, best_count, judge_of
 from scanner_service.analysis.normals.field import Int64Array, NormalField, NormalOptions, Tell, tell_nobody
 from scanner_service.analysis.normals.fitting import Weighting
 from scanner_service.analysis.normals.within import fit_within
@@ -38,8 +38,8 @@ def adaptive_radius(points_mm: Float64Array, options: NormalOptions, tell: Tell 
     """Normals of (n, 3) by weighted plane fits, radius by radius after Mitra, Nguyen and Guibas (2004).
 
     The formula tells how radii should differ from point to point, its constants bound the worst case. So the radius is
-    R (m / M)^a: m the formula's radius at the point, M its median, R the distance to the k-th nearest point. The two
-    halves of the cloud tell k and a (`Deals`).
+    R (m / M)^a: m the formula's radius at the point, M its median, R the distance to the k-th nearest point. Whoever
+    judges numbers of neighbours on this cloud tells k and a (`judge_of`).
 
     Raises
     ------
@@ -52,13 +52,12 @@ def adaptive_radius(points_mm: Float64Array, options: NormalOptions, tell: Tell 
         )
     noise_mm = estimate_noise_mm(points_mm) if options.noise_mm is None else options.noise_mm
     tree = cKDTree(points_mm)
-    deals = Deals.deal(points_mm, Weighting.BIWEIGHT)
+    judge = judge_of(points_mm, Weighting.BIWEIGHT)
     scale, exponent, count = 1.0, 1.0, 0
-    if len(deals.ladder) > 1:
-        reference = deals.reference()
-        count = deals.best(reference)
-        scale = _scale(points_mm, noise_mm, options, deals, float(np.median(_reach(tree, deals.at_mm, count))))
-        exponent, count = _blend(points_mm, noise_mm, options, deals, reference, tree, scale)
+    if judge is not None:
+        count = best_count(judge)
+        scale = _scale(points_mm, noise_mm, options, judge, float(np.median(_reach(tree, judge.at_mm, count))))
+        exponent, count = _blend(points_mm, noise_mm, options, judge, tree, scale)
     found = optimal_radius(points_mm, noise_mm, _law(options, scale), lambda share: tell(0.9 * share))
     radius_mm = found.radius_mm * _REACHES
     if count:
@@ -68,7 +67,7 @@ def adaptive_radius(points_mm: Float64Array, options: NormalOptions, tell: Tell 
     known = "given" if options.noise_mm is not None else "estimated"
     notes = (
         f"constants c1 and c2 are {scale:g} times the customary ones, radii follow the formula to the power "
-        f"{exponent:g} around {count or FIRST_NEIGHBOURS} neighbours: two halves of the cloud agree best so",
+        f"{exponent:g} around {count or FIRST_NEIGHBOURS} neighbours: so the cloud itself tells",
         f"noise {found.noise_mm:.3g} mm, {known}; radius from {radius_mm.min():.3g} to {radius_mm.max():.3g} mm, the "
         f"formula at its floor on {found.at_floor.mean():.0%}, at its ceiling on {found.at_ceiling.mean():.0%} of the "
         "points",
@@ -85,13 +84,13 @@ def adaptive_radius(points_mm: Float64Array, options: NormalOptions, tell: Tell 
     )
 
 
-def _scale(points_mm: Float64Array, noise_mm: float, options: NormalOptions, deals: Deals, reach_mm: float) -> float:
+def _scale(points_mm: Float64Array, noise_mm: float, options: NormalOptions, judge: Judge, reach_mm: float) -> float:
     """The scale, one of SCALES, for which the formula's median radius comes nearest to the one the cloud needs.
 
     The formula bounds the worst case, in which all the curvature of a neighbourhood lies on one side of the point. On
     smooth surfaces its radius is far too small, and a curvature that is measured within it is noise.
     """
-    some = deals.rows[:SCALE_SAMPLE]
+    some = judge.rows[:SCALE_SAMPLE]
     apart = []
     for scale in SCALES:
         found = optimal_radius(points_mm, noise_mm, _law(options, scale), rows=some)
@@ -103,21 +102,20 @@ def _blend(
     points_mm: Float64Array,
     noise_mm: float,
     options: NormalOptions,
-    deals: Deals,
-    reference: Reference,
+    judge: Judge,
     tree: cKDTree,
     scale: float,
 ) -> tuple[float, int]:
     """The exponent, one of EXPONENTS, and the number of neighbours, a step of the ladder, with the least risk."""
-    relative = _relative(optimal_radius(points_mm, noise_mm, _law(options, scale), rows=deals.rows).radius_mm)
-    ladder = deals.ladder
-    near_mm = np.asarray(tree.query(deals.at_mm, k=np.arange(1, ladder[-1] + 1))[0])
+    relative = _relative(optimal_radius(points_mm, noise_mm, _law(options, scale), rows=judge.rows).radius_mm)
+    ladder = judge.ladder
+    near_mm = np.asarray(tree.query(judge.at_mm, k=np.arange(1, ladder[-1] + 1))[0])
     best, chosen = math.inf, (0.0, ladder[0])
     for exponent in EXPONENTS:
         for count in ladder:
             radius = near_mm[:, count - 1] * relative**exponent
             counts: Int64Array = np.maximum((near_mm < radius[:, None] * _REACHES).sum(axis=1), LEAST)
-            risk = deals.risk(counts, reference)
+            risk = judge.risk(counts)
             if risk < best:
                 best, chosen = risk, (exponent, count)
     return chosen

@@ -26,7 +26,7 @@ def orthogonal_distance(points_mm: Float64Array, options: NormalOptions, tell: T
     if count is None:
         weighting = Weighting.BIWEIGHT
         count = choose_count(points_mm, weighting)
-        notes = (f"{count} neighbours, chosen: two halves of the cloud agree best on normals with so many",)
+        notes = (f"{count} neighbours, chosen: as the cloud itself tells, normals err least with so many",)
     pieces = by_number(cKDTree(points_mm), points_mm, np.arange(len(points_mm)), count)
     return fit_all(
         NAME, points_mm, pieces, max_error_rad=options.max_error_rad, weighting=weighting, tell=tell, notes=notes

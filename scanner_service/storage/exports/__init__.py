@@ -1,6 +1,8 @@
-"""Files that go out: points, picture and results, each whole under its name or not there at all."""
+"""Files that go out: points, picture and results, each whole under its name or not there at all.
 
-from scanner_service.storage.exports.density_png import OutlinedRegion, density_png
+Pictures are imported from their own files: the library that draws them takes 40 MB.
+"""
+
 from scanner_service.storage.exports.errors import ExportError, ExportNotConfirmed, ExportNotWritten
 from scanner_service.storage.exports.points_ply import write_points_ply
 from scanner_service.storage.exports.results_json import json_bytes, write_json
@@ -10,8 +12,6 @@ __all__ = [
     "ExportError",
     "ExportNotConfirmed",
     "ExportNotWritten",
-    "OutlinedRegion",
-    "density_png",
     "json_bytes",
     "whole_file",
     "write_json",

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scanner_service.analysis.cloud import analyse_cloud
-from scanner_service.storage.exports import density_png
+from scanner_service.storage.exports.density_png import density_png
 from scanner_service.storage.exports.density_raster import rasterise, view_along
 from scanner_service.storage.exports.label_places import label_places
 from tests.unit.storage.map_snapshots import plate
