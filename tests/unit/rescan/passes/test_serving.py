@@ -105,7 +105,10 @@ def test_missing_nominal_surface_is_served_and_nothing_else_is_guessed():
 def test_a_kept_pass_is_the_pass_that_was_kept(coarse):
     one = plan_passes(*coarse, linear_reach(part_may_turn=True), OPTICS, Wishes(DENSITY, max_passes=1)).passes[0]
     again = kept_pass(json.loads(json.dumps(keep_pass(one), allow_nan=False)))
-    assert again.to_dict() == one.to_dict()
+    told, expected = again.to_dict(), one.to_dict()
+    for name in ("promised_mm2", "explores_mm2"):  # sums over places, of which seven digits are kept
+        assert told.pop(name) == pytest.approx(expected.pop(name), abs=1e-4)
+    assert told == expected
     assert again.places_mm == pytest.approx(one.places_mm, abs=1e-4)
     assert again.place_mm2.sum() == pytest.approx(one.place_mm2.sum(), rel=1e-5)
     turning = dataclasses.replace(one, motion=TurningMotion(one.motion.at_zero, np.array([0.0, 0.0, 1.0]), 20.0))
