@@ -18,8 +18,9 @@ from scanner_service.sessions.references import Nominal, nominal_of
 from scanner_service.sessions.retention import OVER, Kept, Retention, choose
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
+from scanner_service.sessions.source import OnPorts, Source
 from scanner_service.sessions.source_specs import PushSpec, SourceSpec, let_go
-from scanner_service.sessions.sources import OnPorts, PushSource, Source, SpentSource
+from scanner_service.sessions.still_sources import PushSource, SpentSource
 from scanner_service.sessions.withdrawals import SERVICE_ENDED
 from scanner_service.storage.errors import RecordError
 from scanner_service.storage.record import Record, utc_now

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from drivers.scanline import Float64Array, SensorGeometry
-from scanner_service.sessions.sources import OnAWire, Source
+from scanner_service.sessions.source import OnAWire, Source
 from scanner_service.storage.rows import EventRow
 
 

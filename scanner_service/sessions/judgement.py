@@ -33,7 +33,7 @@ from scanner_service.sessions.left_regions import (
 from scanner_service.sessions.mirror import Mirror
 from scanner_service.sessions.references import Nominal
 from scanner_service.sessions.results import Results, conclude
-from scanner_service.sessions.sources import Source
+from scanner_service.sessions.source import Source
 from scanner_service.sessions.updates import VerdictBook
 
 T = TypeVar("T")

@@ -33,7 +33,7 @@ from scanner_service.sessions.pass_planning import PlanQuestion, driven_by, outc
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.rig_setups import RigSetup, is_driven, setup_of, start_pass
 from scanner_service.sessions.session import LiveSession
-from scanner_service.sessions.sources import PushSource
+from scanner_service.sessions.still_sources import PushSource
 
 _LOG = logging.getLogger(__name__)
 

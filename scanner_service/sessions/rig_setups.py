@@ -30,8 +30,9 @@ from scanner_service.rescan.passes.recommendation import RecommendedPass
 from scanner_service.sessions.errors import SessionBusy, SourceUnusable
 from scanner_service.sessions.rig_source import Preparation, RigSource
 from scanner_service.sessions.session import LiveSession
+from scanner_service.sessions.source import Source
 from scanner_service.sessions.source_specs import DeviceSpec
-from scanner_service.sessions.sources import PushSource, Source
+from scanner_service.sessions.still_sources import PushSource
 
 _LOG = logging.getLogger(__name__)
 _DRIVING = StraightMotion(Pose.identity(), np.array([0.0, 1.0, 0.0]))  # the default rig: part = (x, position, z)

@@ -19,7 +19,8 @@ from drivers.scanline import DeviceInfo, Float64Array, Scanline, SensorGeometry
 from drivers.stages.face import DrivenStage
 from drivers.tally import PassTally
 from scanner_service.analysis.passes import PassKey
-from scanner_service.sessions.sources import Sink, tell_scanner_event
+from scanner_service.sessions.device_source import tell_scanner_event
+from scanner_service.sessions.source import Sink
 
 _LOG = logging.getLogger(__name__)
 _PREPARING_LOOK_S = 0.2

@@ -26,11 +26,13 @@ from scanner_service.sessions.judgement import Judgement
 from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.references import NO_NOMINAL, Nominal
 from scanner_service.sessions.reopening import take_in
+from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.scan_clock import ScanClock
 from scanner_service.sessions.settings import SessionSettings
-from scanner_service.sessions.sources import Pausable, PushSource, ReplaySource, Source
+from scanner_service.sessions.source import Pausable, Source
 from scanner_service.sessions.status import Status
+from scanner_service.sessions.still_sources import PushSource
 from scanner_service.sessions.updates import Changes, PointPage, VerdictBook, changes_since, read_page
 from scanner_service.sessions.wires import Wires
 from scanner_service.sessions.withdrawals import SCAN_ENDED, WITHDRAWN

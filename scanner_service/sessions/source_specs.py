@@ -13,10 +13,13 @@ from drivers.running_rig import RunningRig
 from drivers.scanners.native import NativeScanner
 from scanner_service.analysis.passes import pass_key
 from scanner_service.sessions.calibration import calibration_after, geometry_from, towards_sensor_from
+from scanner_service.sessions.device_source import DeviceSource, PassRequest
 from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.left_regions import last_left
+from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.rig_source import Preparation, RigSource
-from scanner_service.sessions.sources import DeviceSource, PassRequest, PushSource, ReplaySource, Source
+from scanner_service.sessions.source import Source
+from scanner_service.sessions.still_sources import PushSource
 from scanner_service.sessions.withdrawals import withdrawn_passes
 from scanner_service.storage.errors import RecordError
 from scanner_service.storage.formats import ReadOptions, Recording, open_recording

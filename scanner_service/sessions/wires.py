@@ -6,7 +6,7 @@ from typing import Any
 
 from drivers.tally import PassTally
 from scanner_service.analysis.passes import PassKey
-from scanner_service.sessions.sources import OnAWire, Source
+from scanner_service.sessions.source import OnAWire, Source
 
 
 @dataclass(frozen=True, slots=True)

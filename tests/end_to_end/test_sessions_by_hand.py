@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 from scanner_service.cli import app
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.fingerprint import verdict_sha256
+from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
-from scanner_service.sessions.sources import ReplaySource
 from scanner_service.storage.record import Record
 from tests.end_to_end.running import wait_for
 from tests.end_to_end.test_live_scan import device, live_client, read_ply

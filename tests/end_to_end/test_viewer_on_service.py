@@ -17,9 +17,9 @@ from matplotlib.image import imread
 
 from drivers.scanline import Pose, Scanline
 from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
-from scanner_service.sessions.sources import ReplaySource
 from scanner_service.storage.record import Record
 from simulators.parts import plate
 from simulators.posed_rig import PosedScanner

@@ -21,7 +21,7 @@ from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SessionError
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.session import LiveSession
-from scanner_service.sessions.sources import PushSource
+from scanner_service.sessions.still_sources import PushSource
 from scanner_service.storage.errors import RecordError, SessionUnknown
 
 router = APIRouter()

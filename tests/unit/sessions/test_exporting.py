@@ -15,10 +15,10 @@ from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.exporting import FORMATS, RECORD_FILE, export_session
 from scanner_service.sessions.fingerprint import raw_sha256, verdict_sha256
 from scanner_service.sessions.references import open_reference
+from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.reporting import report_of
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec, RecordSpec, ReplaySpec
-from scanner_service.sessions.sources import ReplaySource
 from scanner_service.sessions.stored import find_session, pass_ends, read_session
 from scanner_service.storage.exports.errors import ExtraMissing, FormatNotWritten, NotExportable
 from scanner_service.storage.exports.manifest import verify_folder

@@ -10,9 +10,9 @@ from scanner_service.rescan.judgement import REMEDIES, Reason
 from scanner_service.rescan.region import RegionStatus, RescanRegion
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.fingerprint import verdict_sha256
+from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec, RecordSpec
-from scanner_service.sessions.sources import ReplaySource
 from scanner_service.sessions.stored import find_session, read_session
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record

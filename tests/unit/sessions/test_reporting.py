@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from scanner_service.sessions.book import SessionBook
+from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.reporting import fates_of, report_of
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
-from scanner_service.sessions.sources import ReplaySource
 from scanner_service.sessions.stored import find_session, read_session
 from scanner_service.storage.exports.report_content import FateRow, flat_rows, shown
 from scanner_service.storage.exports.report_html import report_html

@@ -9,9 +9,9 @@ import pytest
 from scanner_service.rescan.requirement import Requirement, RequirementUnusable
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SessionBusy, SourceUnusable
+from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec
-from scanner_service.sessions.sources import ReplaySource
 from scanner_service.sessions.withdrawals import SCAN_ENDED
 from scanner_service.storage.errors import CreationKeyReused
 from scanner_service.storage.reader import RecordReader
