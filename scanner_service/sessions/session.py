@@ -43,8 +43,8 @@ from scanner_service.storage.rows import EventRow, SessionRow, Stored
 _LOG = logging.getLogger(__name__)
 REQUIREMENT_CHANGED = "requirement_changed"
 ANALYSIS_PERIOD_S = 1.0
-_COMMIT_PATIENCE_S = 10.0
 """The map is read about this often during a scan; regions are looked for as often as `Cadence` allows."""
+_COMMIT_PATIENCE_S = 10.0
 
 
 class LiveSession:
