@@ -6,9 +6,8 @@ A command is imported when it is asked for: the libraries of all of them togethe
 import importlib
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import click
 import typer
 from typer.core import TyperGroup
 
@@ -38,24 +37,23 @@ COMMANDS = {
 class CommandsWhenAsked(TyperGroup):
     """The commands of COMMANDS, in that order, each imported when somebody asks for it."""
 
-    def list_commands(self, ctx: click.Context) -> list[str]:
+    def list_commands(self, ctx: Any) -> list[str]:
         """The names of all commands."""
         return list(COMMANDS)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of that name, or None."""
         if cmd_name not in COMMANDS:
             return None
         module, name = COMMANDS[cmd_name].split(":")
         found = getattr(importlib.import_module(f"scanner_service.commands.{module}"), name)
-        if isinstance(found, typer.Typer):
-            command = typer.main.get_group(found)
-        else:
+        if not isinstance(found, typer.Typer):
             alone = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
             alone.command(cmd_name)(found)
-            command = typer.main.get_command(alone)
-        command.name = cmd_name
-        return command
+            return typer.main.get_command(alone)
+        group = typer.main.get_group(found)
+        group.name = cmd_name
+        return group
 
 
 app = typer.Typer(

@@ -87,3 +87,29 @@ def test_a_file_and_a_session_are_analysed_and_wrong_requests_are_refused(runnin
         assert refused.json()["type"] == f"/problems/{slug}"
     assert client.delete(address).status_code == 204
     assert client.get(address).status_code == 404
+
+
+def test_clouds_that_make_no_sense_end_with_reasons_or_a_sentence(running):
+    service = running.service()
+    client = service.client
+    rng = np.random.default_rng(2)
+    clouds = {
+        "few": rng.normal(size=(4, 3)),
+        "line": np.outer(np.arange(40.0), [1.0, 2.0, 3.0]),
+        "plane": np.column_stack([rng.uniform(size=(60, 2)), np.zeros(60)]),
+        "doubled": np.repeat(rng.normal(size=(30, 3)), 3, axis=0),
+        "outlier": np.vstack([rng.normal(size=(60, 3)), [[1e8, 0.0, 0.0]]]),
+        "nan": np.full((20, 3), np.nan),
+    }
+    for name, points in clouds.items():
+        np.savetxt(service.data / "replay" / f"{name}.xyz", points)
+        for method in ("orthogonal_distance", "big_delaunay_balls", "general_quadric"):
+            body = {"method": method, "source": {"kind": "file", "file": f"{name}.xyz"}, "orient": name == "doubled"}
+            begun = client.post("/api/v1/analyses", json=body)
+            assert begun.status_code == 202, begun.text
+            job = over(client, begun.headers["Location"])
+            if job["state"] == "failed":
+                assert 40 < len(job["message"]) < 400, (name, method, job)
+            else:
+                assert sum(job["summary"]["reasons"].values()) == job["points"], (name, method, job)
+    assert client.get("/healthz").status_code == 200

@@ -5,6 +5,7 @@ Both are tried at many settings, of which the best one counts: they are told wha
 
 import importlib
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -55,16 +56,24 @@ def _open3d_settings(open3d: Any, counts: list[int]) -> dict[str, Estimator]:
     """
     search = open3d.geometry
 
-    def by(make: Callable[[float], Any], count: int) -> Estimator:
-        return lambda cloud: _open3d_normals(open3d, cloud, make(reach_mm(cloud, count)))
-
-    settings = {f"k={count}": by(lambda _, k=count: search.KDTreeSearchParamKNN(k), count) for count in counts}
+    settings: dict[str, Estimator] = {}
+    for count in counts:
+        settings[f"k={count}"] = partial(_open3d_within, open3d, count, lambda k, _: search.KDTreeSearchParamKNN(k))
     for count in counts[::2]:
-        settings[f"radius of {count}"] = by(search.KDTreeSearchParamRadius, count)
-        settings[f"at most {count} within the radius of {count}"] = by(
-            lambda radius, k=count: search.KDTreeSearchParamHybrid(radius, k), count
+        settings[f"radius of {count}"] = partial(
+            _open3d_within, open3d, count, lambda _, radius: search.KDTreeSearchParamRadius(radius)
+        )
+        settings[f"at most {count} within the radius of {count}"] = partial(
+            _open3d_within, open3d, count, lambda k, radius: search.KDTreeSearchParamHybrid(radius, k)
         )
     return settings
+
+
+def _open3d_within(
+    open3d: Any, count: int, search: Callable[[int, float], Any], points_mm: Float64Array
+) -> Float64Array:
+    """Normals (n, 3) by the search that is made of a number and the radius that suits it."""
+    return _open3d_normals(open3d, points_mm, search(count, reach_mm(points_mm, count)))
 
 
 def reach_mm(points_mm: Float64Array, count: int) -> float:

@@ -42,7 +42,7 @@ class Part:
     @property
     def most(self) -> int:
         """How many neighbours can be asked for."""
-        return self.nearest.shape[1]
+        return int(self.nearest.shape[1])
 
     def axes(self, counts: Int64Array, weighting: Weighting) -> Float64Array:
         """Plane axes (s, 3) from so many (s,) of the nearest points."""
