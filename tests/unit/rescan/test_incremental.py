@@ -153,7 +153,9 @@ def test_regions_found_again_are_those_found_from_nothing(
     analyst.live.close()
 
 
-@pytest.mark.parametrize("surface", ["hole", "pit", "roof"])
+@pytest.mark.parametrize(
+    "surface", ["hole", pytest.param("pit", marks=pytest.mark.long), pytest.param("roof", marks=pytest.mark.long)]
+)
 def test_after_every_line_of_a_long_pass_regions_are_those_found_from_nothing_and_little_is_judged(
     surface: str,
 ) -> None:
