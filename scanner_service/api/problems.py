@@ -138,7 +138,8 @@ def _from_table(problem: Problem) -> Callable[[HTTPConnection, Exception], Respo
     def respond(connection: HTTPConnection, error: Exception) -> Response:
         if problem.status >= 500:
             _log.error("%s: %s: %s", connection.scope.get("path"), type(error).__name__, error)
-        return problem_response(problem, str(error) or problem.title)
+        fields = getattr(error, "fields", ())  # what the client named them by, so that a form can say it beside them
+        return problem_response(problem, str(error) or problem.title, {"fields": list(fields)} if fields else None)
 
     return respond
 

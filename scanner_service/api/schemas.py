@@ -1,7 +1,8 @@
 """What requests may say, checked before anything else sees it; angles in degrees only here."""
 
 import math
-from typing import Annotated, Literal
+from dataclasses import asdict
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -9,8 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from drivers.scanline import Float64Array, Scanline
 from scanner_service.analysis.normals.field import NormalOptions
 from scanner_service.analysis.radius import LiveRule
-from scanner_service.rescan.presets import requirement_of
-from scanner_service.rescan.requirement import Interest, Requirement
+from scanner_service.rescan.presets import preset_of, requirement_of
+from scanner_service.rescan.requirement import Interest, Requirement, RequirementUnusable
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.storage.formats.reference_mesh import ReferenceSpec
 
@@ -91,6 +92,7 @@ class RequirementIn(Strict):
 
     preset: Annotated[str, Field(max_length=50, examples=["standard"])] | None = None
     density_per_mm2: Positive | None = None
+    density_share: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] | None = None
     line_spacing_mm: Positive | None = None
     chord_error_mm: Positive | None = None
     finest_line_spacing_mm: Positive | None = None
@@ -110,6 +112,18 @@ class RequirementIn(Strict):
         )
 
 
+def requirement_told(requirement: Requirement) -> dict[str, Any]:
+    """What is asked for, for JSON, under the names of `RequirementIn`: sent back, it asks for the same."""
+    told = {name: getattr(requirement, name) for name in RequirementIn.model_fields if hasattr(requirement, name)}
+    incidence_rad = requirement.incidence_rad
+    return {
+        "preset": preset_of(requirement),
+        **told,
+        "incidence_deg": None if incidence_rad is None else round(math.degrees(incidence_rad), 9),
+        "interest": None if requirement.interest is None else asdict(requirement.interest),
+    }
+
+
 class ReferenceIn(Strict):
     """The nominal part: an STL or OBJ file in the service's replay folder, registered to the part frame."""
 
@@ -118,7 +132,10 @@ class ReferenceIn(Strict):
 
 
 class SettingsIn(Strict):
-    """Radius, reliability and requirement; everything may be left out."""
+    """Radius, reliability and requirement; everything may be left out.
+
+    `density_per_mm2` is short for that of the requirement, where answers tell it.
+    """
 
     radius_rule: LiveRule = "line"
     uncertainty_mm: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.1
@@ -132,10 +149,19 @@ class SettingsIn(Strict):
 
     def to_settings(self) -> SessionSettings:
         """As the session keeps it; raises RequirementUnusable."""
-        values = self.model_dump(exclude={"requirement", "reference"})
+        values = self.model_dump(exclude={"requirement", "reference", "density_per_mm2"})
+        asked, alone = self.requirement, self.density_per_mm2
+        if None not in (alone, asked.density_per_mm2) and alone != asked.density_per_mm2:
+            raise RequirementUnusable(
+                f"the density is asked for twice, {alone:g} points/mm² in settings and {asked.density_per_mm2:g} in "
+                "their requirement: leave the one in settings out",
+                "density_per_mm2",
+            )
+        if alone is not None:
+            asked = asked.model_copy(update={"density_per_mm2": alone})
         return SessionSettings(
             max_normal_error_rad=math.radians(values.pop("max_normal_error_deg")),
-            target=self.requirement.to_requirement(),
+            target=asked.to_requirement(),
             reference=None if self.reference is None else ReferenceSpec(self.reference.file, self.reference.units),
             **values,
         )

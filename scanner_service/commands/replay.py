@@ -90,10 +90,10 @@ def replay_command(
                 source, origin_mm = spec.open(recording), (0.0, 0.0, 0.0)
                 settings = SessionSettings(
                     point_spacing_mm=0.0 if plain_radius else _known(recording.point_spacing_mm),
-                    density_per_mm2=density,
                     noise_mm=noise or 0.0,
                     target=requirement_of(
                         preset,
+                        density_per_mm2=density,
                         line_spacing_mm=surface_spacing,
                         chord_error_mm=chord_error,
                         incidence_rad=None if incidence is None else math.radians(incidence),

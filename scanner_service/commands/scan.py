@@ -9,6 +9,7 @@ import typer
 
 from scanner_service.commands.replay import play, tell
 from scanner_service.commands.terminal import check_folder, plain_errors, show_json
+from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.outputs import write_outputs
 from scanner_service.sessions.settings import SessionSettings
@@ -45,7 +46,9 @@ def scan_command(
             stack.callback(source.stop)  # whatever happens, the stage rests and the laser is off
             book = SessionBook(opened)
             stack.callback(book.close)
-            live = book.create(rig.name, spec, SessionSettings(density_per_mm2=density), (0.0, 0.0, 0.0), source)
+            live = book.create(
+                rig.name, spec, SessionSettings(target=Requirement(density_per_mm2=density)), (0.0, 0.0, 0.0), source
+            )
             play(live, quiet=as_json)
             summary = write_outputs(out, live)
             results = live.results()

@@ -62,9 +62,8 @@ class RegionBook:
 
     @property
     def current(self) -> tuple[RescanRegion, ...]:
-        """Open, rescanned and unreachable regions, by falling priority, numbered."""
-        regions = sorted((known.region for known in self._known.values()), key=lambda region: -region.priority)
-        return tuple(replace(region, number=number) for number, region in enumerate(regions, start=1))
+        """Open, rescanned and unreachable regions, by falling priority."""
+        return tuple(sorted((known.region for known in self._known.values()), key=lambda region: -region.priority))
 
     @property
     def resolved(self) -> tuple[RescanRegion, ...]:
@@ -169,7 +168,7 @@ class RegionBook:
             reason = Reason[str(entry["reason"]).upper()]
             spacing = entry.get("line_spacing_mm")
             region = RescanRegion(
-                number=0,
+                number=int(entry["id"]),
                 reason=reason,
                 outline_mm=(),
                 area_mm2=last.area_mm2,
@@ -198,7 +197,7 @@ class RegionBook:
     ) -> _Known:
         moment = RegionMoment(self._version, RegionStatus.OPEN, region.area_mm2, region.priority, "found")
         changes.append(Change(self._next, region.reason, moment))
-        known = replace(region, region_id=self._next, history=(moment,))
+        known = replace(region, number=self._next, region_id=self._next, history=(moment,))
         return _Known(known, cubes, passes, _places_of(region))
 
     def _continued(
@@ -218,7 +217,7 @@ class RegionBook:
         elif region.reason is not old.region.reason:
             why = f"was {old.region.reason.label} before"
         known = _Known(
-            replace(region, region_id=known_id, status=old.region.status, history=old.region.history),
+            replace(region, number=known_id, region_id=known_id, status=old.region.status, history=old.region.history),
             cubes,
             passes | old.passes,
             _places_of(region),

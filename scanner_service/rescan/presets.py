@@ -25,6 +25,12 @@ def requirement_of(preset: str | None = None, **asked: Any) -> Requirement:
     RequirementUnusable : no such preset, or what is asked for cannot be met.
     """
     if preset is not None and preset not in PRESETS:
-        raise RequirementUnusable(f"there is no preset {preset}; the presets are {', '.join(PRESETS)}")
+        raise RequirementUnusable(f"there is no preset {preset}; the presets are {', '.join(PRESETS)}", "preset")
     base = Requirement() if preset is None else PRESETS[preset]
     return replace(base, **{name: value for name, value in asked.items() if value is not None})
+
+
+def preset_of(requirement: Requirement) -> str | None:
+    """The name of the preset that asks for just the same; None when there is none."""
+    asked = replace(requirement, radius_constant_mm=Requirement().radius_constant_mm)
+    return next((name for name, preset in PRESETS.items() if preset == asked), None)

@@ -111,12 +111,12 @@ class RescanRegion:
     and 0 for isolated points. 0 is not worth a pass, near 1 is large and empty.
     `point_rows` (point_count,) are rows of the snapshot: the failing points, or a gap's ends.
 
-    `number` is the place in the list of one report; `region_id` names the region as long as the session lives (0: not
-    followed, a report by itself). `confidence` = (agreeing + 1) / (points + 2): how many of its points fail by their
-    own measurement, not by their neighbours' only. `line_spacing_mm` is the largest spacing on the surface that the
-    requirement allows there, NaN if unknown. `limit` is what it fails by, None where nothing was measured (a shadow,
-    the end of the range, surface that nobody touched) or it is not known. `history` are the changes of its status, the
-    oldest first.
+    `number` is what everybody calls it: `region_id`, which names it as long as the session lives, and in a report by
+    itself, whose regions are not followed (0), its place in the list. `confidence` = (agreeing + 1) / (points + 2): how
+    many of its points fail by their own measurement, not by their neighbours' only. `line_spacing_mm` is the largest
+    spacing on the surface that the requirement allows there, NaN if unknown. `limit` is what it fails by, None where
+    nothing was measured (a shadow, the end of the range, surface that nobody touched) or it is not known. `history` are
+    the changes of its status, the oldest first.
     """
 
     number: int

@@ -13,7 +13,14 @@ _LEAST_AREA_MM2 = 1.0
 
 
 class RequirementUnusable(ValueError):
-    """A requirement that no scan could be judged by; the message names the field, its value and what it must be."""
+    """A requirement that no scan could be judged by; the message names the field, its value and what it must be.
+
+    `fields` are the names of the fields that it is about.
+    """
+
+    def __init__(self, message: str, *fields: str) -> None:
+        super().__init__(message)
+        self.fields = fields
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +37,14 @@ class Interest:
 
     def __post_init__(self) -> None:
         if len(self.low_mm) != 3 or len(self.high_mm) != 3 or not all(map(isfinite, (*self.low_mm, *self.high_mm))):
-            raise RequirementUnusable("a region of interest is two corners of three finite millimetres each")
+            raise RequirementUnusable(
+                "a region of interest is two corners of three finite millimetres each", "interest"
+            )
         if not all(low < high for low, high in zip(self.low_mm, self.high_mm, strict=True)):
             raise RequirementUnusable(
                 f"the region of interest is empty: its low corner {list(self.low_mm)} must lie below its high corner "
-                f"{list(self.high_mm)} in x, y and z"
+                f"{list(self.high_mm)} in x, y and z",
+                "interest",
             )
 
     def holds(self, points_mm: Float64Array) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -93,13 +103,17 @@ class Requirement:
         for name in ("density_per_mm2", "search_mm", "line_spacing_mm", "chord_error_mm", "noise_mm"):
             value = getattr(self, name)
             if value is not None and not (isfinite(value) and value > 0):
-                raise RequirementUnusable(f"{name} must be greater than 0, or left out for the default, not {value}")
+                raise RequirementUnusable(
+                    f"{name} must be greater than 0, or left out for the default, not {value}", name
+                )
         if not 0 < self.density_share <= 1:
-            raise RequirementUnusable(f"density_share must be above 0 and at most 1, not {self.density_share}")
+            raise RequirementUnusable(
+                f"density_share must be above 0 and at most 1, not {self.density_share}", "density_share"
+            )
         for name in ("radius_constant_mm", "finest_line_spacing_mm"):
             value = getattr(self, name)
             if not (isfinite(value) and value > 0):
-                raise RequirementUnusable(f"{name} must be greater than 0 mm, not {value}")
+                raise RequirementUnusable(f"{name} must be greater than 0 mm, not {value}", name)
         if not (isfinite(self.noise_factor) and self.noise_factor >= 1):
             raise RequirementUnusable(f"noise_factor must be at least 1, not {self.noise_factor}")
         if self.region_area_mm2 is not None and not (isfinite(self.region_area_mm2) and self.region_area_mm2 >= 0):
@@ -110,10 +124,13 @@ class Requirement:
             raise RequirementUnusable(f"region_angle_deg must be above 0 and at most 180, not {self.region_angle_deg}")
         if self.incidence_rad is not None and not 0 < self.incidence_rad < pi / 2:
             raise RequirementUnusable(
-                f"the largest incidence angle must lie between 0° and 90°, not {degrees(self.incidence_rad):g}°"
+                f"the largest incidence angle must lie between 0° and 90°, not {degrees(self.incidence_rad):g}°",
+                "incidence_deg",
             )
         if self.coverage_share is not None and not 0 < self.coverage_share <= 1:
-            raise RequirementUnusable(f"coverage_share must be above 0 and at most 1, not {self.coverage_share}")
+            raise RequirementUnusable(
+                f"coverage_share must be above 0 and at most 1, not {self.coverage_share}", "coverage_share"
+            )
         self._agrees_with_itself()
 
     def _agrees_with_itself(self) -> None:
@@ -121,17 +138,22 @@ class Requirement:
         if self.line_spacing_mm is not None and self.line_spacing_mm < self.finest_line_spacing_mm:
             raise RequirementUnusable(
                 f"a line spacing of at most {self.line_spacing_mm:g} mm is asked for, and none finer than "
-                f"{self.finest_line_spacing_mm:g} mm: raise line_spacing_mm or lower finest_line_spacing_mm"
+                f"{self.finest_line_spacing_mm:g} mm: raise line_spacing_mm or lower finest_line_spacing_mm",
+                "line_spacing_mm",
+                "finest_line_spacing_mm",
             )
         if self.chord_error_mm is not None and self.noise_mm is not None and self.chord_error_mm < self.noise_mm:
             raise RequirementUnusable(
                 f"a chord error of at most {self.chord_error_mm:g} mm cannot be told where noise up to "
-                f"{self.noise_mm:g} mm is accepted: raise chord_error_mm or lower noise_mm"
+                f"{self.noise_mm:g} mm is accepted: raise chord_error_mm or lower noise_mm",
+                "chord_error_mm",
+                "noise_mm",
             )
         if self.interest is not None and (self.region_area_mm2 or 0.0) > 6.0 * self.interest.largest_face_mm2:
             raise RequirementUnusable(
                 f"region_area_mm2 is {self.region_area_mm2:g} mm², more than the surface of the region of interest: "
-                "nothing could ever be reported; lower it or enlarge the region of interest"
+                "nothing could ever be reported; lower it or enlarge the region of interest",
+                "interest",
             )
 
     def to_dict(self) -> dict[str, Any]:
@@ -158,7 +180,8 @@ class Requirement:
             if value is not None and value < noise_mm:
                 raise RequirementUnusable(
                     f"{name} asks for at most {value:g} mm, but the scanner's own noise is {noise_mm:g} mm: "
-                    f"ask for at least that"
+                    f"ask for at least that",
+                    name,
                 )
 
     def noise_limit_mm(self, noise_mm: float | None) -> float | None:

@@ -50,8 +50,8 @@ class LeftRegions:
         ]
         ids = [int(entry["id"]) for entry in self.kept["listed"]]
         numbered = [
-            replace(region, number=number, region_id=region_id)
-            for number, (region, region_id) in enumerate(zip(listed, ids, strict=True), start=1)
+            replace(region, number=region_id, region_id=region_id)
+            for region, region_id in zip(listed, ids, strict=True)
         ]
         resolved = [_read(entry) for entry in self.kept["mended"]]
         return replace(found, regions=as_in(book, numbered), resolved=as_in(book, resolved))
@@ -118,7 +118,7 @@ def _read(kept: Mapping[str, Any]) -> RescanRegion:
         return float("nan") if kept[name] is None else float(kept[name])
 
     return RescanRegion(
-        number=int(kept["number"]),
+        number=int(kept["id"]),
         reason=Reason[str(kept["reason"]).upper()],
         outline_mm=tuple(np.array(loop, dtype=np.float64).reshape(-1, 3) for loop in kept["outline_mm"]),
         area_mm2=float(kept["area_mm2"]),

@@ -51,7 +51,7 @@ class PassDesk:
         self._changes = 0  # of what plans are made from
         self._setup: RigSetup | None = None
         self._plan: Plan | None = None
-        self._planned_for = EVERYTHING
+        self._planned_for: tuple[object, ...] = ()  # what is served, and what is asked for
         self._orders = OrderBook()
         self._tried = Tried.nothing()
         self._standing: Pose | None = None
@@ -69,7 +69,7 @@ class PassDesk:
             self._changed()
 
     def plan(self, serving: Serving | None = None) -> Plan:
-        """Recommended passes for the map as it is now; made anew only when the map or what is to be served has changed.
+        """Recommended passes for the map as it is now; made anew when map, requirement or what is served changed.
 
         Regions that none of the rig's poses sees are marked as unreachable, and those that one sees after all as
         open again.
@@ -187,6 +187,8 @@ class PassDesk:
     def guidance(self, order_id: int) -> Guidance:
         """Where the scanner is beside an accepted pass, from the latest scanlines; raises PassUnknown, SessionBusy."""
         order = self.order(order_id)
+        if order.is_over:
+            raise SessionBusy(f"pass order {order_id} is {order.status.value}: nobody needs guidance along it any more")
         latest = self._session.latest_lines()
         if not latest:
             raise SessionBusy("no scanline has come yet: switch the scanner on and move it over the part")
@@ -248,16 +250,16 @@ class PassDesk:
         """
         while True:
             results = self._session.results() or self._session.fresh_results()
-            setup = self._setup_now(results)
+            setup, wanted = self._setup_now(results), (serving, results.requirement, results.reference is not None)
             with self._lock:
                 known, changes = self._plan, self._changes
-                if known is not None and known.version == results.report.version and self._planned_for == serving:
+                if known is not None and known.version == results.report.version and self._planned_for == wanted:
                     return known, None
                 question = self._question(results, setup, serving)
             plan = question.answered()
             with self._lock:
                 if self._changes == changes:
-                    self._plan, self._planned_for = plan, serving
+                    self._plan, self._planned_for = plan, wanted
                     return plan, results
 
     def _begun(self, order: PassOrder, part_is_turned: bool) -> tuple[Results, RigSetup]:

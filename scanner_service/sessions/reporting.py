@@ -14,6 +14,7 @@ from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.results import Results, summarise
 from scanner_service.sessions.stored import Stage, StoredSession
 from scanner_service.sessions.wires import joined
+from scanner_service.storage.exports.density_png import letters_of
 from scanner_service.storage.exports.report_content import (
     FateRow,
     PassRow,
@@ -67,7 +68,7 @@ def fates_of(first: Results, last: Results) -> tuple[FateRow, ...]:
     """What became of each region of the first pass. Rows of a map stay what they are, so its points are found again."""
     return tuple(
         FateRow(
-            region.number,
+            letters_of(region.number),
             region.reason.label.replace("_", " "),
             region.area_mm2,
             float(last.report.rescan[region.point_rows].mean()) if len(region.point_rows) else 0.0,

@@ -34,9 +34,9 @@ class Verdict:
 class Results:
     """A snapshot, judged.
 
-    `regions` are those of the report, followed through the session: with ids, status and history, numbered by falling
-    priority; `resolved` those that were mended. `reference` is the coverage of the nominal part, None without one, or
-    as long as there are too few points, or when `reference_refused` says why it cannot be told.
+    `regions` are those of the report, followed through the session: with ids, status and history, by falling priority;
+    `resolved` those that were mended. `reference` is the coverage of the nominal part, None without one, or as long as
+    there are too few points, or when `reference_refused` says why it cannot be told.
     """
 
     snapshot: MapSnapshot

@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from drivers.scanline import Scanline
 from scanner_service.analysis.intake import StoredLine
 from scanner_service.analysis.passes import PassKey
 from scanner_service.rescan.region import RegionStatus
+from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.cadence import Cadence
 from scanner_service.sessions.calibration import CALIBRATED, calibration_of
 from scanner_service.sessions.chronicle import Chronicle
@@ -36,6 +38,7 @@ from scanner_service.storage.record import Record
 from scanner_service.storage.rows import EventRow, SessionRow, Stored
 
 _LOG = logging.getLogger(__name__)
+REQUIREMENT_CHANGED = "requirement_changed"
 ANALYSIS_PERIOD_S = 1.0
 _COMMIT_PATIENCE_S = 10.0
 """The map is read about this often during a scan; regions are looked for as often as `Cadence` allows."""
@@ -68,6 +71,7 @@ class LiveSession:
         self._latest: deque[tuple[Scanline, float]] = deque(maxlen=8)
         self._over = threading.Condition()
         self._lock = threading.RLock()
+        self._asking = threading.Lock()  # one after the other may change what is asked for
         self._held = False
         self._closing = threading.Event()
         self._is_closing = False
@@ -203,6 +207,25 @@ class LiveSession:
         if self._state in ("stopped", "failed"):  # what the scan left was of the verdict before
             self._judgement.write_regions_down()
         return count
+
+    def judge_by(self, requirement: Requirement) -> None:
+        """Ask for something else from now on: what was scanned already is judged anew before this returns.
+
+        Raises
+        ------
+        RequirementUnusable : it contradicts itself, or the scanner's noise; what was asked for before stays.
+        RecordError : the record does not take it; what was asked for before stays.
+        """
+        with self._asking:
+            before, settings = self.settings, replace(self.settings, target=requirement)
+            self._record.change_settings(self.row.session_id, settings.to_dict())  # durable first: it outlasts us
+            self.row, self.settings = replace(self.row, settings=settings.to_dict()), settings
+            self._judgement.judge_by(settings.requirement())
+            told = {"before": before.target.to_dict(), "now": settings.target.to_dict()}
+            self.event(REQUIREMENT_CHANGED, told)
+            self._judge()
+            if self._state in ("stopped", "failed"):  # what the scan left was of the verdict before
+                self._judgement.write_regions_down()
 
     @property
     def can_pause(self) -> bool:
@@ -398,6 +421,7 @@ class LiveSession:
                 or (results.reference_refused if results else None)
             ),
             held=self._held,
+            holds=results.holds if results is not None else None,
         )
 
     # -- inside -------------------------------------------------------------------------------------------------

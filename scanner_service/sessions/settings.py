@@ -1,4 +1,4 @@
-"""What a session is told when it is created, and keeps for ever; knows no device and no thread."""
+"""What a session is told when it is created; only its requirement may change. Knows no device and no thread."""
 
 import math
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from typing import Any
 
 from scanner_service.analysis.live_map import MapSettings
 from scanner_service.analysis.radius import LiveRule, RadiusSettings
-from scanner_service.rescan.requirement import Requirement, RequirementUnusable
+from scanner_service.rescan.requirement import Requirement
 from scanner_service.storage.formats.reference_mesh import ReferenceSpec
 
 
@@ -17,8 +17,8 @@ class SessionSettings:
 
     `radius_rule` is `line`, `flexible` or `global`; `uncertainty_mm` is c of Eq. 6.3. `point_spacing_mm` None measures
     it line by line, a number states it, 0 ignores it. `noise_mm` is one standard deviation of the scanner.
-    `target` is what the scan must reach; `density_per_mm2` states its density alone, and may not contradict it.
-    `reference` is the nominal part that coverage is measured against, None when there is none.
+    `target` is what the scan must reach. `reference` is the nominal part that coverage is measured against, None when
+    there is none.
 
     Raises
     ------
@@ -30,7 +30,6 @@ class SessionSettings:
     point_spacing_mm: float | None = None
     noise_mm: float = 0.01
     max_normal_error_rad: float = math.radians(5.0)
-    density_per_mm2: float | None = None
     max_points: int = 20_000_000
     threads: int = 1
     target: Requirement = field(default_factory=Requirement)
@@ -52,16 +51,7 @@ class SessionSettings:
 
     def requirement(self) -> Requirement:
         """The part that the rescan regions are judged by."""
-        asked, alone = self.target.density_per_mm2, self.density_per_mm2
-        if asked is not None and alone is not None and asked != alone:
-            raise RequirementUnusable(
-                f"the density is asked for twice, {alone:g} and {asked:g} points/mm²: leave one of them out"
-            )
-        return replace(
-            self.target,
-            density_per_mm2=alone if asked is None else asked,
-            radius_constant_mm=self.uncertainty_mm,
-        )
+        return replace(self.target, radius_constant_mm=self.uncertainty_mm)
 
     def to_dict(self) -> dict[str, Any]:
         """As it is kept in the record."""
@@ -69,12 +59,18 @@ class SessionSettings:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "SessionSettings":
-        """From the record; names that this version does not know raise TypeError."""
+        """From the record; names that this version does not know raise TypeError.
+
+        Records of the first version have a required density beside the target.
+        """
+        values = dict(values)
         target, reference = values.get("target"), values.get("reference")
+        asked = Requirement() if target is None else Requirement.from_dict(target)
+        alone = values.pop("density_per_mm2", None)
         return cls(
             **{
                 **values,
-                "target": Requirement() if target is None else Requirement.from_dict(target),
+                "target": asked if alone is None else replace(asked, density_per_mm2=alone),
                 "reference": None if reference is None else ReferenceSpec(**reference),
             }
         )

@@ -13,6 +13,7 @@ class Status:
     `lines` and `points`: stored in the record, and counted in the map. `verdict_age_s`: how long ago the map was read
     that regions and coverage are of, NaN before the first verdict. `coverage_kind`: `observed`, of the
     surface seen, or `reference`, of the nominal part. `held`: a pause that lasts until somebody resumes.
+    `holds`: whether the coverage asked for is reached, None when none is asked for or none is known.
     """
 
     session_id: str
@@ -30,3 +31,4 @@ class Status:
     durable: dict[str, dict[str, int]]
     message: str | None
     held: bool
+    holds: bool | None

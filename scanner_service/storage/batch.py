@@ -160,6 +160,12 @@ class Batch:
             self._put(notes, session_id, before)
         return session_from(row | _renamed(before))
 
+    def change_settings(self, session_id: str, settings: Mapping[str, Any], now_utc: str) -> SessionRow:
+        """Put other settings in the place of a session's own."""
+        row = self._sound_session(session_id)
+        changes = {"settings": to_json(settings, "settings"), "changed_utc": now_utc}
+        return session_from(self._update(session_id, row, changes))
+
     def save_ledger(self, session_id: str, account: Mapping[str, Any], now_utc: str) -> None:
         """Keep the account of a session's losses, in place of the one before."""
         self._tail(session_id)

@@ -268,6 +268,13 @@ class Record:
         now = self._now()
         return self._wait_for(lambda batch: batch.describe(session_id, name, notes, now))
 
+    def change_settings(self, session_id: str, settings: Mapping[str, Any]) -> SessionRow:
+        """Keep other settings of a session; raises what `set_state` does, NotStorable."""
+        settings = dict(settings)
+        to_json(settings, "settings")
+        now = self._now()
+        return self._wait_for(lambda batch: batch.change_settings(session_id, settings, now))
+
     def save_ledger(self, session_id: str, account: Mapping[str, Any]) -> Answer[None]:
         """Queue the account of a session's losses, in place of the one before; answered and refused as an event is."""
         account = dict(account)

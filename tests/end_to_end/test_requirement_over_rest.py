@@ -99,3 +99,63 @@ def test_what_cannot_be_meant_is_refused_with_the_reason(
     assert answer.status_code == 422, answer.text
     assert says in answer.json()["detail"]
     assert client.get("/api/v1/sessions").json() == before
+
+
+@pytest.fixture(scope="module")
+def scanned(client: httpx.Client) -> str:
+    """The address of a session that was scanned with 0.2 mm between its lines, and is over."""
+    made = client.post("/api/v1/sessions", json={"source": {"kind": "push"}})
+    path = f"/api/v1/sessions/{made.json()['id']}"
+    client.post(f"{path}/start")
+    assert client.post(f"{path}/scanlines", json={"lines": [_line(n) for n in range(12)]}).status_code == 200
+    assert client.post(f"{path}/stop").json()["requirement"]["coverage_share"] is None
+    return path
+
+
+def test_what_is_asked_for_may_change_after_the_scan_and_everything_is_judged_anew(
+    client: httpx.Client, scanned: str
+) -> None:
+    assert client.get(f"{scanned}/regions").json()["regions"] == []
+    asked = {"density_per_mm2": 60.0, "coverage_share": 0.9}
+    answered = client.put(f"{scanned}/requirement", json=asked)
+    assert answered.status_code == 200, answered.text
+    assert answered.json()["holds"] is False and answered.json()["coverage"] < 0.9
+    assert {name: answered.json()["requirement"][name] for name in asked} == asked
+    sparse = client.get(f"{scanned}/regions").json()
+    assert {(one["reason"], one["required_per_mm2"]) for one in sparse["regions"]} == {("sparse", 60.0)}
+    told = answered.json()["requirement"]
+    assert client.put(f"{scanned}/requirement", json=told).json()["requirement"] == told, "what is told asks for itself"
+
+    loose = client.put(f"{scanned}/requirement", json={"preset": "standard"}).json()
+    assert (loose["requirement"]["preset"], loose["holds"]) == ("standard", True)
+    assert client.get(f"{scanned}/regions").json()["regions"] == []
+    status = client.get(scanned).json()
+    assert (status["requirement"], status["holds"]) == (loose["requirement"], True)
+    kinds = [event["kind"] for event in client.get(f"{scanned}/events").json()["events"]]
+    assert kinds.count("requirement_changed") == 3
+    assert kinds[-1] == "regions_followed", "what a later opening goes on with is of the new verdict"
+
+
+def test_a_refused_requirement_names_its_fields_and_leaves_what_was_asked_for(
+    client: httpx.Client, scanned: str
+) -> None:
+    before = client.get(f"{scanned}/requirement").json()
+    for asked, fields in (
+        ({"noise_mm": 0.005}, ["noise_mm"]),
+        ({"chord_error_mm": 0.02, "noise_mm": 0.03}, ["chord_error_mm", "noise_mm"]),
+        ({"line_spacing_mm": 0.04}, ["line_spacing_mm", "finest_line_spacing_mm"]),
+        ({"preset": "best"}, ["preset"]),
+        ({"interest": {"low_mm": [0, 0, 0], "high_mm": [1, 0, 1]}}, ["interest"]),
+    ):
+        refused = client.put(f"{scanned}/requirement", json=asked)
+        assert (refused.status_code, refused.json()["fields"]) == (422, fields), refused.text
+    refused = client.put(f"{scanned}/requirement", json={"density_per_mm2": 0})
+    assert (refused.status_code, refused.json()["errors"][0]["at"]) == (422, "body.density_per_mm2")
+    assert client.get(f"{scanned}/requirement").json() == before
+
+
+@pytest.mark.parametrize("settings", [{"density_per_mm2": 7.0}, {"requirement": {"density_per_mm2": 7.0}}])
+def test_a_density_is_told_in_one_place_wherever_it_was_asked_for(client: httpx.Client, settings: dict) -> None:
+    made = client.post("/api/v1/sessions", json={"source": {"kind": "push"}, "settings": settings}).json()
+    assert made["requirement"]["density_per_mm2"] == made["settings"]["target"]["density_per_mm2"] == 7.0
+    assert "density_per_mm2" not in made["settings"]

@@ -66,8 +66,10 @@ def get_order(desk: Desk, order: int) -> Response:
 
 
 @router.post("/pass-orders/{order}/carry-out", dependencies=[operator])
-def carry_out(desk: Desk, order: int, body: CarryOutIn) -> Response:
+def carry_out(desk: Desk, order: int, body: CarryOutIn = CarryOutIn()) -> Response:  # noqa: B008 - it is frozen
     """Drive an accepted pass, or wait for the scanlines that a hand brings. The laser is switched on.
+
+    It may come without a body: then the part is not turned.
 
     An order that is refused is cancelled, with the reason as its message.
     """
@@ -97,7 +99,7 @@ def get_guidance(desk: Desk, order: int) -> Response:
 
 
 @router.post("/rescan", status_code=202, dependencies=[operator])
-def start_loop(desk: Desk, body: LoopIn) -> Response:
+def start_loop(desk: Desk, body: LoopIn = LoopIn()) -> Response:  # noqa: B008 - it is frozen
     """Plan and carry out by itself until the requirement holds, nothing reachable is left, or a limit is met."""
     return answer(desk.run_loop(body.to_limits()).to_dict(), 202)
 

@@ -20,8 +20,10 @@ from scanner_service.api.schemas import (
     PassIn,
     PushSourceIn,
     ReplaySourceIn,
+    RequirementIn,
     RigSourceIn,
     SessionIn,
+    requirement_told,
 )
 from scanner_service.api.scopes import require
 from scanner_service.rescan.presets import PRESETS
@@ -120,6 +122,8 @@ def status_answer(session: LiveSession) -> dict[str, Any]:
         "calibration": session.row.calibration,
         "held": status.held,
         "can_pause": session.can_pause,
+        "requirement": requirement_told(session.settings.target),
+        "holds": status.holds,
     }
 
 
@@ -146,7 +150,7 @@ def list_sessions(
 @router.get("/presets", dependencies=[viewer])
 def list_presets() -> Response:
     """Requirements by name, from the loosest to the finest; null is what is not asked for."""
-    return answer({"presets": {name: preset.to_dict() for name, preset in PRESETS.items()}})
+    return answer({"presets": {name: requirement_told(preset) for name, preset in PRESETS.items()}})
 
 
 @router.post("", status_code=201)
@@ -199,6 +203,32 @@ def describe_session(request: Request, session_id: str, body: DescriptionIn) -> 
     """Change the name or the notes of a session."""
     row = book_of(request).describe(session_id, name=body.name, notes=body.notes)
     return answer(row_answer(book_of(request), row))
+
+
+@router.get("/{session_id}/requirement", dependencies=[viewer])
+def get_requirement(session: Session) -> Response:
+    """What the session is judged by, and whether the coverage asked for is reached."""
+    return answer(_requirement_answer(session))
+
+
+@router.put("/{session_id}/requirement", dependencies=[operator])
+def put_requirement(session: Session, body: RequirementIn) -> Response:
+    """Ask for something else, in the place of all that was asked for; the answer comes when all is judged anew.
+
+    It may be sent before, during and after a scan, and stays with the session; that it changed is an event.
+    """
+    session.judge_by(body.to_requirement())
+    return answer(_requirement_answer(session))
+
+
+def _requirement_answer(session: LiveSession) -> dict[str, Any]:
+    status = session.status()
+    return {
+        "requirement": requirement_told(session.settings.target),
+        "holds": status.holds,
+        "coverage": status.coverage,
+        "coverage_kind": status.coverage_kind,
+    }
 
 
 @router.post("/{session_id}/open", status_code=202, dependencies=[operator])

@@ -3,7 +3,7 @@
 Only matplotlib's objects are used, on the Agg canvas: no global state, so several threads may draw at once.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from io import BytesIO
 from typing import Any, Literal, Protocol
@@ -55,7 +55,7 @@ class OutlinedRegion(Protocol):
 
     @property
     def number(self) -> int:
-        """The number by which lists name the region."""
+        """The number by which everybody calls the region."""
 
     @property
     def reason(self) -> object:
@@ -78,6 +78,7 @@ def density_figure(
     colours: Colours = "viridis",
     dpi: int = 150,
     top_per_mm2: float | None = None,
+    lettered: bool = False,
 ) -> Figure:
     """Draw the density of the surface seen along `direction`; 11 inches wide, at most 8.25 high, at `dpi`.
 
@@ -91,6 +92,7 @@ def density_figure(
     direction : (3,) the way the eye looks, part frame; down z by default: x to the right, y up.
     colours : "viridis", or "blue-red" (blue dense, red sparse).
     top_per_mm2 : end of the scale, so that two pictures can be compared; None takes it from the data.
+    lettered : call regions A, B, … for 1, 2, …, beside another picture whose numbers are of other regions.
 
     Raises
     ------
@@ -115,7 +117,7 @@ def density_figure(
     if raster is not None:
         _surface(part, raster, colour_map, top)
         shown = _outlines(part, regions, view)
-        _labels(part, regions, view)
+        _labels(part, regions, view, letters_of if lettered else str)
         _legend(figure, part, raster, shown, regions)
     else:
         part.text(0.5, 0.5, "no points yet", transform=part.transAxes, ha="center", color=_INK, fontsize=14)
@@ -216,8 +218,17 @@ def _outlines(axes: Axes, regions: Sequence[OutlinedRegion], view: View) -> dict
     return counts
 
 
-def _labels(axes: Axes, regions: Sequence[OutlinedRegion], view: View) -> None:
-    """Number the first regions beside their longest outline, with a line to it."""
+def letters_of(number: int) -> str:
+    """A, B, … Z, AA, AB, … for 1, 2, …; the number as it is below 1."""
+    letters = ""
+    while number > 0:
+        number, last = divmod(number - 1, 26)
+        letters = chr(ord("A") + last) + letters
+    return letters or str(number)
+
+
+def _labels(axes: Axes, regions: Sequence[OutlinedRegion], view: View, name: Callable[[int], str]) -> None:
+    """Name the first regions beside their longest outline, with a line to it."""
     named = [(region.number, loops[0]) for region in regions if (loops := _loops(region))][:_LABELS]
     flat = [np.stack([loop @ view.right, loop @ view.up], axis=1) for _, loop in named]
     boxes = [(loop.min(axis=0), loop.max(axis=0)) for loop in flat]
@@ -232,7 +243,7 @@ def _labels(axes: Axes, regions: Sequence[OutlinedRegion], view: View) -> None:
         axes.text(
             float(place[0]),
             float(place[1]),
-            str(number),
+            name(number),
             fontsize=9 if len(named) <= 20 else 7,
             fontweight="bold",
             ha="center",
@@ -274,7 +285,7 @@ def _legend(
         text.set_parse_math(False)
     remark = f"pixel {raster.pixel_mm:.2g} mm; each shows points within {raster.reach_mm:.2g} mm"
     if len(regions) > _LABELS:
-        remark += f"; the first {_LABELS} of {len(regions)} regions are numbered"
+        remark += f"; the {_LABELS} most urgent of {len(regions)} regions are named"
     axes.text(
         0.995, 0.008, remark, transform=axes.transAxes, ha="right", va="bottom", fontsize=7, color="#777777", zorder=6
     )

@@ -34,9 +34,12 @@ class PassRow:
 
 @dataclass(frozen=True, slots=True)
 class FateRow:
-    """What became of a region of the first pass: the share of its points that were still wanting at the end."""
+    """What became of a region of the first pass: the share of its points that were still wanting at the end.
 
-    number: int
+    `name` is a letter: the numbers of regions are of those at the end.
+    """
+
+    name: str
     reason: str
     area_mm2: float
     left_share: float

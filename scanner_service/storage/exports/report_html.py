@@ -117,7 +117,7 @@ def _damage(content: ReportContent) -> list[str]:
 
 
 def map_png(content: ReportContent, found: Verdictful, dpi: int) -> bytes:
-    """The density map of one moment, on the scale that all maps of the report share."""
+    """The density map of one moment, on the scale that all maps share; regions of the first pass have letters."""
     return density_png(
         found.snapshot,
         found.report.regions,
@@ -126,6 +126,7 @@ def map_png(content: ReportContent, found: Verdictful, dpi: int) -> bytes:
         required_per_mm2=content.required_per_mm2,
         top_per_mm2=scale_top_per_mm2(content.final.snapshot, content.required_per_mm2),
         dpi=dpi,
+        lettered=found is content.first,
     )
 
 
@@ -188,10 +189,10 @@ def _before(content: ReportContent) -> list[str]:
     if not content.fates:
         return [*parts, "<p>The first pass had left none.</p>"]
     rows = [
-        (str(fate.number), fate.reason, f"{fate.area_mm2:,.1f}", percent(fate.left_share), fate.outcome)
+        (fate.name, fate.reason, f"{fate.area_mm2:,.1f}", percent(fate.left_share), fate.outcome)
         for fate in content.fates[:MOST_REGIONS]
     ]
-    parts.append(_table(("# then", "reason", "area mm²", "still wanting", "outcome"), rows, numbers=(0, 2, 3)))
+    parts.append(_table(("in the map above", "reason", "area mm²", "still wanting", "outcome"), rows, numbers=(2, 3)))
     return parts
 
 

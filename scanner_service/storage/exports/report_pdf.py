@@ -173,9 +173,9 @@ class _Book:
             self.text("The first pass had left none.")
             return
         self._table(
-            (("# then", 0.6, True), ("reason", 1.4, False), ("area mm²", 1.1, True), ("still wanting", 1.1, True),
+            (("in the map", 0.8, False), ("reason", 1.4, False), ("area mm²", 1.1, True), ("still wanting", 1.1, True),
              ("outcome", 1.6, False)),
-            [(str(fate.number), fate.reason, f"{fate.area_mm2:,.1f}", percent(fate.left_share), fate.outcome)
+            [(fate.name, fate.reason, f"{fate.area_mm2:,.1f}", percent(fate.left_share), fate.outcome)
              for fate in content.fates[:MOST_REGIONS]],
         )  # fmt: skip
 

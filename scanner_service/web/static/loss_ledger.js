@@ -96,9 +96,14 @@ function flat(tally, name = "", into = {}) {
 export function headline(losses) {
   if (!losses) return "";
   const { lines, points, device } = losses;
-  const lostLines = sum(lines?.refused) + (lines?.conflicts ?? 0) + sum(device?.lines?.lost);
+  const passes = losses.passes ?? [];
+  const partial = sum(passes.map((account) => account.lines.partial));
+  const lostOf = ({ lines: account }) => sum(Object.fromEntries(Object.entries(account.lost ?? {}).filter(([reason]) => !UNWANTED.has(reason))));
+  // the accounts of the passes hold all of them, from the wire to the record, the device's only the latest pass
+  const lostLines = passes.length ? sum(passes.map(lostOf)) : sum(lines?.refused) + (lines?.conflicts ?? 0) + sum(device?.lines?.lost);
   const { dropout: _, ...lostInMap } = points?.dropped ?? {};
   const lostPoints = sum(lostInMap) + (device?.lines ? 0 : sum(device?.dropped));
   const said = [lostLines && plural(lostLines, "scanline", "scanlines"), lostPoints && plural(lostPoints, "point", "points")].filter(Boolean);
-  return said.length ? `${said.join(", ")} lost` : "nothing lost";
+  const lost = said.length ? `${said.join(", ")} lost` : "";
+  return [lost, partial && `${plural(partial, "scanline", "scanlines")} partial`].filter(Boolean).join(", ") || "nothing lost";
 }

@@ -5,14 +5,18 @@ import { SCALES } from "./colours.js";
 import { byId, element } from "./element.js";
 import { ExportMenu } from "./exports.js";
 import { drawRuler, drawTriad } from "./gauges.js";
+import { Guide } from "./guide.js";
+import { InterestBox } from "./interest_box.js";
 import { listenToKeys } from "./keyboard.js";
 import { drawLegend } from "./legend.js";
-import { whole, words } from "./numbers.js";
+import { opening as capitalised, whole, words } from "./numbers.js";
 import { drawFigures, drawInspector, drawLosses, drawRegions } from "./panels.js";
+import { PassArrow } from "./pass_arrow.js";
 import { PassesPanel } from "./passes_panel.js";
 import { pickPoint } from "./picking.js";
 import { PointCloud } from "./point_cloud.js";
 import { RegionOverlay } from "./region_overlay.js";
+import { RequirementPanel } from "./requirement_panel.js";
 import { SceneView } from "./scene_view.js";
 import { listSessions, pauseSession, resumeSession, startSession, stopSession } from "./service.js";
 import { SessionPicker } from "./session_picker.js";
@@ -27,17 +31,26 @@ let chosenRegion = null;
 let inspectedRow = -1;
 let connectionState = "none";
 let frames = 0;
+let ordered = null; // the order that is waited for, or carried out
 let troubled = { text: "", until: 0 };
 
 const session = new SessionView({ points, status, regions, opening, connection, trouble });
 const view = openView();
 const cloud = new PointCloud(session.store);
 const overlay = new RegionOverlay(byId("labels"), chooseRegion);
+const interest = new InterestBox();
 const marker = element("div.marker", { hidden: true, "aria-hidden": "true" });
 byId("view").append(marker);
-view.scene.add(cloud.object, overlay.group);
+view.scene.add(cloud.object, overlay.group, interest.object);
 
-const passes = new PassesPanel(trouble, () => session.open(session.id));
+const arrow = new PassArrow();
+view.scene.add(arrow.object);
+const guide = new Guide(byId("guide"), (share) => {
+  arrow.at(share);
+  view.invalidate();
+});
+const passes = new PassesPanel({ trouble, scanned: () => session.open(session.id), onOrder: followOrder, onPass: (pass) => showPass(pass ?? ordered?.pass ?? null) });
+const requirement = new RequirementPanel({ onInterest: showInterest, partBox });
 const exports = new ExportMenu(byId("export-links"), byId("exports"));
 const picker = new SessionPicker({ onChoose: openSession, onMissing: (text) => notice(text), current: () => session.id });
 new FileBringer({
@@ -96,6 +109,8 @@ function status() {
   say();
   drawFigures(byId("figures"), told, session.store, session.box);
   drawLosses(byId("losses"), byId("losses-count"), told.losses);
+  requirement.status(told);
+  passes.status(told);
 }
 
 // The service builds the map of a closed session from the record, line by line.
@@ -157,6 +172,27 @@ function freeAreas(width, height) {
   return areas.length ? areas : [whole];
 }
 
+function followOrder(order) {
+  ordered = order;
+  showPass(order?.pass ?? null);
+  guide.follow(session.id, order?.status === "running" && session.status?.source?.kind === "push" ? order : null);
+}
+
+function showPass(pass) {
+  arrow.show(pass, session.origin, session.box ? [0, 1, 2].map((axis) => (session.box.low[axis] + session.box.high[axis]) / 2) : null);
+  view.invalidate();
+}
+
+function showInterest(box) {
+  interest.show(box, session.origin);
+  view.invalidate();
+}
+
+// How far the points reach, part frame: [lowest, highest] corner, or null before there are any.
+function partBox() {
+  return session.box ? [session.box.low, session.box.high].map((corner) => [...corner].map((value, axis) => value + session.origin[axis])) : null;
+}
+
 function beforeDraw() {
   cloud.upload();
   cloud.pointPx = Math.min(9, Math.max(1.6, 1.5 * session.spacingMm * view.pixelsPerMm)) * look.pointScale * view.renderer.getPixelRatio();
@@ -215,6 +251,7 @@ function openSession(chosen) {
   look.range = look.autoRange ? [0, 1] : look.range;
   session.open(chosen.id);
   passes.open(chosen.id);
+  requirement.open(chosen.id);
   explainEmptiness();
   overlay.show([], session.origin, view.radius);
   drawFigures(byId("figures"), null, session.store, null);
@@ -227,7 +264,7 @@ function openSession(chosen) {
 }
 
 function chooseRegion(number) {
-  const region = session.regions?.find((candidate) => candidate.number === number);
+  const region = session.regions?.find((candidate) => candidate.id === number);
   if (!region) return;
   chosenRegion = number;
   overlay.choose(number);
@@ -259,7 +296,7 @@ function rowUnder(event) {
 
 function say() {
   const trouble = performance.now() < troubled.until && troubled.text;
-  const text = trouble || session.status?.message || "";
+  const text = capitalised(trouble || session.status?.message || "");
   const place = byId("message");
   place.hidden = !text;
   place.dataset.kind = trouble ? "trouble" : (session.status?.state ?? "");

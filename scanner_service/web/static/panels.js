@@ -33,7 +33,7 @@ export function drawFigures(place, status, store, box) {
 
 export function drawLosses(place, count, losses) {
   count.textContent = headline(losses);
-  count.classList.toggle("lost", count.textContent.endsWith(" lost") && !count.textContent.startsWith("nothing"));
+  count.classList.toggle("lost", losses !== null && count.textContent !== "nothing lost");
   const tally = ({ title, unit, total, rows }) => {
     const share = (value) => (total > 0 && value > 0 ? element("span.unit", {}, percent(value / total)) : null);
     const some = rows.filter(([, value, kind]) => value > 0 || kind === "kept");
@@ -63,8 +63,8 @@ export function drawRegions(place, count, regions, chosen, onChoose, status = nu
       { "data-said": said },
       element(
         "button.region",
-        { type: "button", "aria-pressed": String(region.number === chosen), onclick: () => onChoose(region.number), title: region.remedy ? `Remedy: ${region.remedy}` : null },
-        element("span.number", {}, String(region.number)),
+        { type: "button", "aria-pressed": String(region.id === chosen), onclick: () => onChoose(region.id), title: region.remedy ? `Remedy: ${region.remedy}` : null },
+        element("span.number", {}, String(region.id)),
         element("span.reason", {}, sentence(reason.text), lineSample(reason)),
         element("span.area", {}, significant(region.area_mm2), element("span.unit", {}, "mm²")),
         element("span.density", {}, `${significant(region.measured_per_mm2)} of ${significant(region.required_per_mm2)}`, element("span.unit", {}, "points/mm²")),
@@ -76,7 +76,7 @@ export function drawRegions(place, count, regions, chosen, onChoose, status = nu
     );
   };
   // an entry that says the same stays the same element: a click that is under way while the list is renewed still counts
-  const said = (region) => JSON.stringify([region.number === chosen, { ...region, outline_mm: null, centroid_mm: null, normal: null }]);
+  const said = (region) => JSON.stringify([region.id === chosen, { ...region, outline_mm: null, centroid_mm: null, normal: null }]);
   const old = new Map([...place.children].map((entry) => [entry.dataset.said, entry]));
   const focused = place.contains(document.activeElement) ? [...place.querySelectorAll("button")].indexOf(document.activeElement) : -1;
   const scrolled = place.scrollTop;

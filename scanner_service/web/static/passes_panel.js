@@ -1,48 +1,85 @@
-// Recommended passes beside the picture: the list, buttons to accept and carry out, and what each pass brought.
+// Recommended passes beside the picture: the list, buttons to accept and carry out, and what became of each order.
 
 import { byId, element } from "./element.js";
-import { plural, significant } from "./numbers.js";
+import { plural, sentence, significant, words } from "./numbers.js";
 import { acceptPass, cancelOrder, carryOut, endLoop, listOrders, listPasses, loopState, startLoop } from "./service.js";
 
+const FOLLOW_MS = 1000;
 const unit = (text) => element("span.unit", {}, text);
+
+// Where a pass or an order goes, the same words wherever it is told of.
+const way = (pass) => [`${significant(pass.start_mm)} to ${significant(pass.end_mm)}`, unit("mm"), `, ${plural(pass.lines, "line", "lines")} ${significant(pass.line_spacing_mm)}`, unit("mm"), " apart"];
+
+// The regions that a pass serves, by the numbers that the list and the picture have: "regions 3, 7 and unseen surface".
+export function served(pass) {
+  const named = pass.serves.map(({ region }) => region).filter((region) => region !== null);
+  const regions = named.length ? `${named.length > 1 ? "regions" : "region"} ${named.join(", ")}` : "";
+  const unseen = named.length < pass.serves.length ? "unseen surface" : "";
+  return [regions, unseen].filter(Boolean).join(" and ");
+}
+
+// What became of an order that is over, in words; "" while nothing has.
+export function fate({ status, message, outcome, reached_end: whole }) {
+  const said = outcome ? `promised ${significant(outcome.promised_mm2)}, reached ${significant(outcome.reached_mm2)} mm²` : "";
+  const explored = outcome?.expected_mm2 >= 1 ? `explored: ${significant(outcome.found_mm2)} found of ${significant(outcome.expected_mm2)} mm² expected` : "";
+  const early = status === "done" && whole === false ? "ended before its end" : "";
+  return [said, explored, early, message].filter(Boolean).join("; ");
+}
 
 export class PassesPanel {
   #id = null;
   #asked = 0;
-  #said = null; // how far the orders were when last heard of
+  #state = null; // of the session, as last heard
+  #orders = [];
+  #timer = null;
 
-  // scanned: a pass has begun or ended, so the session's points are flowing again, or have changed
-  constructor(trouble, scanned) {
-    this.trouble = trouble;
-    this.scanned = scanned;
-    byId("find-passes").addEventListener("click", () => this.refresh());
+  // trouble(text); scanned(): a pass has begun or ended, so the session's points flow again, or have changed;
+  // onOrder(order): the one that is waited for or carried out, null when there is none; onPass(pass) is pointed at, or null
+  constructor({ trouble, scanned, onOrder, onPass }) {
+    Object.assign(this, { trouble, scanned, onOrder, onPass });
+    byId("find-passes").addEventListener("click", () => this.#refresh(true));
     byId("run-loop").addEventListener("click", () => this.#act(() => startLoop(this.#id)));
     byId("end-loop").addEventListener("click", () => this.#act(() => endLoop(this.#id)));
   }
 
   open(id) {
     this.#id = id;
-    this.#said = null;
+    this.#state = null;
+    this.#orders = [];
+    clearTimeout(this.#timer);
     byId("passes").replaceChildren(element("li.empty", {}, "Not asked for yet."));
     byId("orders").replaceChildren();
     byId("passes-count").textContent = "";
     byId("loop-note").textContent = "";
     byId("end-loop").hidden = true;
+    this.onOrder(null);
+    this.onPass(null);
   }
 
-  async refresh() {
+  // Orders outlast the page and the service: they are looked at when the session is opened, and when its state changes.
+  status(told) {
+    if (told.state === this.#state) return;
+    this.#state = told.state;
+    this.#refresh(false);
+  }
+
+  async #refresh(withPlan) {
     const id = this.#id;
     const asked = ++this.#asked;
+    clearTimeout(this.#timer);
     try {
-      const [plan, { orders }, { loop }] = [await listPasses(id), await listOrders(id), await loopState(id)];
+      const [{ orders }, { loop }] = [await listOrders(id), await loopState(id)];
+      const plan = withPlan ? await listPasses(id) : null;
       if (id !== this.#id || asked !== this.#asked) return;
+      const wasRunning = this.#orders.some((order) => order.status === "running");
+      const isRunning = orders.some((order) => order.status === "running");
+      this.#orders = orders;
       this.#draw(plan, orders, loop);
-      const said = orders.filter((order) => order.status !== "accepted").map((order) => order.order + order.status).join();
-      if (this.#said !== null && said !== this.#said) this.scanned();
-      this.#said = said;
-      if (loop?.running || orders.some((order) => order.status === "running")) setTimeout(() => this.refresh(), 1000);
+      if (wasRunning !== isRunning) this.scanned();
+      if (loop?.running || isRunning) this.#timer = setTimeout(() => this.#refresh(false), FOLLOW_MS);
+      else if (wasRunning) this.#refresh(true); // what it brought changes what is worth another one
     } catch (refusal) {
-      this.trouble(refusal.message);
+      if (id === this.#id) this.trouble(refusal.message);
     }
   }
 
@@ -52,44 +89,61 @@ export class PassesPanel {
       this.trouble("");
     } catch (refusal) {
       this.trouble(refusal.message);
+      await this.#refresh(false);
+      return;
     }
-    await this.refresh();
+    await this.#refresh(true);
   }
 
   #draw(plan, orders, loop) {
-    byId("passes-count").textContent = String(plan.passes.length);
-    const none = element("li.empty", {}, "Nothing that this rig reaches would be a gain.");
-    byId("passes").replaceChildren(...(plan.passes.length ? plan.passes.map((one) => this.#pass(one)) : [none]));
-    byId("orders").replaceChildren(...orders.map((order) => this.#order(order)));
+    if (plan !== null) {
+      byId("passes-count").textContent = String(plan.passes.length);
+      const none = element("li.empty", {}, "Nothing that this rig reaches would be a gain.");
+      byId("passes").replaceChildren(...(plan.passes.length ? plan.passes.map((one) => this.#pass(one)) : [none]));
+      this.onPass(null);
+    }
+    byId("orders").replaceChildren(...orders.toReversed().map((order) => this.#order(order)));
+    this.onOrder(orders.findLast(({ status }) => status === "running") ?? orders.findLast(({ status }) => status === "accepted") ?? null);
     byId("end-loop").hidden = !loop?.running;
+    byId("run-loop").hidden = Boolean(loop?.running);
     byId("loop-note").textContent = loop === null ? "" : loop.running ? `Closed loop: pass ${loop.passes} of at most ${loop.max_passes}` : `The loop ended: ${loop.why_ended}.`;
   }
 
   #pass(one) {
-    const served = one.serves.filter((item) => item.region !== null).length;
+    const pointed = { onmouseenter: () => this.onPass(one), onmouseleave: () => this.onPass(null), onfocusin: () => this.onPass(one), onfocusout: () => this.onPass(null) };
     return element(
       "li.pass",
-      {},
-      element("strong", {}, `${one.number}. ${significant(one.gain_mm2)}`, unit("mm²"), ` in ${significant(one.duration_s + one.approach_s, 2)}`, unit("s")),
-      element("span", {}, `${significant(one.start_mm)} to ${significant(one.end_mm)}`, unit("mm"), `, ${plural(one.lines, "line", "lines")} ${significant(one.line_spacing_mm)}`, unit("mm"), " apart"),
-      element("span", {}, served ? `for ${plural(served, "region", "regions")}` : "for unseen surface"),
+      pointed,
+      element("strong", {}, `Pass ${one.number}: ${significant(one.gain_mm2)}`, unit("mm²"), ` in ${significant(one.duration_s + one.approach_s, 2)}`, unit("s")),
+      element("span", {}, ...way(one)),
+      element("span", {}, `for ${served(one) || "nothing"}`),
       one.explores_mm2 > 0.5 * one.gain_mm2 ? element("span", {}, "Explores: most of it may not be there.") : null,
       one.turn_part ? element("span", {}, `First: ${one.turn_part}.`) : null,
       element("button", { type: "button", onclick: () => this.#act(() => acceptPass(this.#id, one.number)) }, "Accept"),
     );
   }
 
-  #order({ order, status, message, outcome, pass }) {
-    const explored = outcome?.expected_mm2 >= 1 ? `; explored: ${significant(outcome.found_mm2)} found of ${significant(outcome.expected_mm2)} mm² expected` : "";
-    const said = outcome ? `promised ${significant(outcome.promised_mm2)}, reached ${significant(outcome.reached_mm2)} mm²${explored}` : (message ?? status);
-    const go = () => this.#act(() => carryOut(this.#id, order, pass.turn_part !== null));
+  #order(order) {
+    const { order: number, status, pass } = order;
+    const go = () => this.#act(() => carryOut(this.#id, number, pass.turn_part !== null));
+    const said = fate(order);
+    const waits = status === "accepted";
     return element(
       "li.pass",
-      {},
-      element("span", {}, `Order ${order}: ${said}`),
-      outcome?.doubt ? element("span.doubt", { role: "alert" }, `Warning: ${outcome.doubt}.`) : null,
-      status === "accepted" ? element("button", { type: "button", onclick: go }, pass.turn_part ? "The part is turned: carry out" : "Carry out (laser on)") : null,
-      status === "accepted" ? element("button.quiet", { type: "button", onclick: () => this.#act(() => cancelOrder(this.#id, order)) }, "Cancel") : null,
+      { "data-order": number },
+      element("span.head", {}, element("strong", {}, `Order ${number}`), element("span.badge", { "data-state": status }, words(status))),
+      element("span", {}, ...way(pass)),
+      waits && pass.turn_part ? element("span", {}, `First: ${pass.turn_part}.`) : null,
+      said ? element("span", {}, sentence(said)) : null,
+      order.outcome?.doubt ? element("span.doubt", { role: "alert" }, `Warning: ${order.outcome.doubt}.`) : null,
+      waits
+        ? element(
+            "span.row",
+            {},
+            element("button", { type: "button", onclick: go }, pass.turn_part ? "The part is turned: carry out" : "Carry out (laser on)"),
+            element("button.quiet", { type: "button", onclick: () => this.#act(() => cancelOrder(this.#id, number)) }, "Cancel"),
+          )
+        : null,
     );
   }
 }

@@ -19,7 +19,7 @@ export class RegionOverlay {
 
   // The numbers of the regions whose outline is in the picture.
   get outlined() {
-    return this.shown ? this.items.filter(({ front }) => front.visible).map(({ region }) => region.number) : [];
+    return this.shown ? this.items.filter(({ front }) => front.visible).map(({ region }) => region.id) : [];
   }
 
   set visible(on) {
@@ -35,7 +35,7 @@ export class RegionOverlay {
       line.material.dispose();
     }
     this.group.clear();
-    this.kept = new Map(this.items.map((item) => [item.region.number, item.label]));
+    this.kept = new Map(this.items.map((item) => [item.region.id, item.label]));
     this.items = regions.map((region) => this.#build(region, origin, sizeMm));
     const labels = this.items.map((item) => item.label);
     if (labels.length !== this.labels.children.length || labels.some((label, i) => label !== this.labels.children[i])) this.labels.replaceChildren(...labels);
@@ -43,7 +43,7 @@ export class RegionOverlay {
 
   choose(number) {
     for (const item of this.items) {
-      const chosen = item.region.number === number;
+      const chosen = item.region.id === number;
       item.chosen = chosen;
       item.label.classList.toggle("chosen", chosen);
       const width = chosen ? 4 : 1.5 + Math.min(1, item.region.priority ?? 0); // the urgent ones stand out
@@ -78,8 +78,8 @@ export class RegionOverlay {
       made.renderOrder = order + 1;
     });
     front.computeLineDistances();
-    const label = this.kept.get(region.number) ?? this.#label(region.number);
-    label.title = `Region ${region.number}: ${reason.text}`;
+    const label = this.kept.get(region.id) ?? this.#label(region.id);
+    label.title = `Region ${region.id}: ${reason.text}`;
     return { region, reason, behind, halo, front, label, chosen: false, centre: region.centroid_mm.map((value, axis) => value - origin[axis]), normal };
   }
 

@@ -2,9 +2,10 @@
 
 // What the service refused, in its own words (problem details), with the HTTP status; 0 when it did not answer.
 export class ServiceRefusal extends Error {
-  constructor(status, detail) {
+  constructor(status, detail, body = null) {
     super(detail);
     this.status = status;
+    this.body = body; // the problem document, which may name fields
   }
 }
 
@@ -20,7 +21,7 @@ async function answer(path, options) {
   const body = await response.json().catch(() => null);
   if (response.ok) return body;
   if (response.status === 401) throw new ServiceRefusal(401, "Not signed in. Open the one-time address that the service printed when it started.");
-  throw new ServiceRefusal(response.status, body?.detail ?? body?.title ?? `The service answered ${response.status}.`);
+  throw new ServiceRefusal(response.status, body?.detail ?? body?.title ?? `The service answered ${response.status}.`, body);
 }
 
 const sessionPath = (id, rest) => `api/v1/sessions/${encodeURIComponent(id)}/${rest}`;
@@ -57,9 +58,19 @@ export const loopState = (id) => answer(sessionPath(id, "rescan"));
 
 const send = (path, body, method = "POST") => answer(path, { method, headers: { accept: "application/json", "content-type": "application/json" }, body: JSON.stringify(body) });
 
+// {presets: {name: requirement}}, from the loosest to the finest.
+export const listPresets = () => answer("api/v1/sessions/presets");
+
+// Ask for something else; answered when everything is judged anew: {requirement, holds, coverage}.
+export const askFor = (id, requirement) => send(sessionPath(id, "requirement"), requirement, "PUT");
+
 export const acceptPass = (id, number) => answer(sessionPath(id, `recommended-passes/${number}/accept`), { method: "POST" });
 
 export const cancelOrder = (id, order) => answer(sessionPath(id, `pass-orders/${order}`), { method: "DELETE" });
+
+// Where the scanner is beside a pass that a hand scans: {along_mm, aside_mm, angle_deg, speed_mm_per_s, wanted_mm_per_s, say}.
+export const guidanceOf = (id, order) => answer(sessionPath(id, `pass-orders/${order}/guidance`));
+
 export const carryOut = (id, order, turned) => send(sessionPath(id, `pass-orders/${order}/carry-out`), { part_is_turned: turned });
 
 export const startLoop = (id) => send(sessionPath(id, "rescan"), {});

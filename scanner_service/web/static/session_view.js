@@ -118,7 +118,7 @@ export class SessionView {
       if (moved && this.regions) this.tell.regions();
     } else if (message.type === "regions") {
       for (const region of message.regions) this.#known.set(region.id, region);
-      this.regions = message.order.map((id, at) => ({ ...this.#known.get(id), number: at + 1 }));
+      this.regions = message.order.map((id) => this.#known.get(id)); // the most urgent first, each called by its id
       this.#known = new Map(this.regions.map((region) => [region.id, region]));
       this.tell.regions();
     } else if (message.type === "opening") {

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from scanner_service.rescan.presets import PRESETS, requirement_of
+from scanner_service.rescan.presets import PRESETS, preset_of, requirement_of
 from scanner_service.rescan.requirement import Interest, Requirement, RequirementUnusable
 from scanner_service.sessions.settings import SessionSettings
 
@@ -72,8 +72,6 @@ def test_requirements_that_contradict_themselves_are_refused_with_the_reason(ask
 def test_a_requirement_below_the_scanner_s_own_noise_is_refused_and_an_empty_box_too() -> None:
     with pytest.raises(RequirementUnusable, match="own noise"):
         SessionSettings(noise_mm=0.05, target=Requirement(noise_mm=0.02))
-    with pytest.raises(RequirementUnusable, match="twice"):
-        SessionSettings(density_per_mm2=10.0, target=Requirement(density_per_mm2=12.0))
     with pytest.raises(RequirementUnusable, match="empty"):
         Interest((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
 
@@ -85,3 +83,16 @@ def test_presets_survive_the_record(name: str) -> None:
     kept = json.loads(json.dumps(settings.to_dict(), allow_nan=False))
     assert SessionSettings.from_dict(kept) == settings
     assert settings.requirement().coverage_share == PRESETS[name].coverage_share
+
+
+def test_a_density_that_an_older_record_has_beside_the_target_is_asked_for_still() -> None:
+    kept = SessionSettings().to_dict()
+    assert SessionSettings.from_dict({**kept, "density_per_mm2": 8.0}).requirement().density_per_mm2 == 8.0
+    assert SessionSettings.from_dict({**kept, "density_per_mm2": None}) == SessionSettings()
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_a_preset_is_known_by_what_it_asks_for(name: str) -> None:
+    assert preset_of(PRESETS[name]) == preset_of(SessionSettings(target=PRESETS[name], noise_mm=0.0).requirement())
+    assert preset_of(PRESETS[name]) == name
+    assert preset_of(requirement_of(name, coverage_share=0.5)) is None

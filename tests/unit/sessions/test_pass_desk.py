@@ -16,6 +16,7 @@ from scanner_service.rescan.passes.serving import Serving
 from scanner_service.rescan.passes.tried import TRIES
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions import pass_planning
+from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.closed_loop import LoopLimits
 from scanner_service.sessions.errors import PassUnknown, SessionBusy
@@ -40,7 +41,9 @@ def book(tmp_path):
 @pytest.fixture
 def scanned(book):
     """A step scanned too coarsely by a client, and the scanner in its hand."""
-    session = book.create("step", PushSpec(), SessionSettings(density_per_mm2=DENSITY, max_points=400_000))
+    session = book.create(
+        "step", PushSpec(), SessionSettings(target=Requirement(density_per_mm2=DENSITY), max_points=400_000)
+    )
     posed = PosedScanner(SCANNER, step().surface, np.random.default_rng(1))
     session.start()
     push(session, posed, FROM_ABOVE, -1.0, 41.0, 0.6)

@@ -87,7 +87,7 @@ def test_the_second_pass_is_told_to_have_filled_the_gap_of_the_first(content, st
 
 def test_what_is_as_bad_as_before_stays_open(stored):
     assert {fate.left_share for fate in fates_of(stored.first, stored.first)} == {1.0}
-    assert [FateRow(1, "steep", 1.0, share).outcome for share in (0, 0.05, 0.2, 0.5, 1)] == [
+    assert [FateRow("A", "steep", 1.0, share).outcome for share in (0, 0.05, 0.2, 0.5, 1)] == [
         "resolved", "resolved", "partly resolved", "open", "open",
     ]  # fmt: skip
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from scanner_service.rescan.requirement import Requirement, RequirementUnusable
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SessionBusy, SourceUnusable
 from scanner_service.sessions.settings import SessionSettings
@@ -162,3 +163,24 @@ def test_a_record_is_let_go_of_when_no_session_is_made_of_it(book, other, monkey
     with pytest.raises(CreationKeyReused):
         book.create("made", RecordSpec.of_file(other, None, None), key=CreationKey("a" * 64, "c" * 64))
     assert times_open(other) == 0
+
+
+def test_what_is_asked_for_later_outlasts_the_service_with_its_regions(tmp_path):
+    asked = Requirement(density_per_mm2=90.0)
+    with Record.open(tmp_path / "record.sqlite") as record:
+        book = SessionBook(record)
+        session = replay(book, LINES)
+        assert session.results().regions == ()
+        session.judge_by(asked)
+        (region,) = session.results().regions
+        with pytest.raises(RequirementUnusable, match="own noise"):
+            session.judge_by(Requirement(noise_mm=1e-6))
+        assert session.settings.target == asked
+        book.close()
+    with Record.open(tmp_path / "record.sqlite") as record:
+        book = SessionBook(record)
+        again = book.get(session.row.session_id)
+        assert again.settings.target == asked
+        (found,) = again.fresh_results().regions
+        assert (found.region_id, found.history) == (region.region_id, region.history)
+        book.close()
