@@ -26,9 +26,9 @@ from scanner_service.commands.terminal import (
     fail,
     loss_sentence,
     plain_errors,
-    regions_table,
     scan_progress,
     show_json,
+    tell_regions,
 )
 from scanner_service.sessions.outputs import OUTPUT_FILES
 
@@ -115,7 +115,7 @@ def scan(client: httpx.Client, part: str, simulator: dict[str, Any]) -> str:
 
 def tell(regions: list[dict[str, Any]], summary: dict[str, Any], out: Path) -> None:
     """What was found, and where it was written."""
-    console.print(regions_table(regions, "Rescan regions"))
+    tell_regions(regions)
     coverage = summary["coverage"]["share"]
     console.print(
         f"{summary['points']:,} points in {summary['scanlines']:,} scanlines, "

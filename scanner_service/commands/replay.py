@@ -16,9 +16,9 @@ from scanner_service.commands.terminal import (
     errors,
     loss_sentence,
     plain_errors,
-    regions_table,
     scan_progress,
     show_json,
+    tell_regions,
 )
 from scanner_service.rescan.presets import requirement_of
 from scanner_service.rescan.reference import ReferenceSurface
@@ -144,7 +144,7 @@ def _facts(session: LiveSession) -> dict[str, Any]:
 
 def tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
     """Print the regions as a table, and what the scan came to."""
-    console.print(regions_table(regions, "Rescan regions"))
+    tell_regions(regions)
     share, held = summary["coverage"]["share"], summary["coverage"]["holds"]
     nominal = summary["coverage"]["kind"] == "reference"
     console.print(

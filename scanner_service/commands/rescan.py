@@ -69,7 +69,7 @@ def _loop(client: httpx.Client, where: str, limits: dict[str, Any], quiet: bool)
         orders = _ask(client.get(f"{where}/pass-orders"))["orders"]
         while told < len(orders) and orders[told]["status"] in _OVER:
             if not quiet:
-                errors.print(_said(orders[told]), highlight=False)
+                errors.print(f"order {orders[told]['order']}: {_said(orders[told])}", highlight=False, soft_wrap=True)
             told += 1
         if not loop["running"]:
             return {"loop": loop, "orders": orders[before:]}
@@ -99,24 +99,25 @@ def _one(client: httpx.Client, where: str, number: int, turned: bool, serving: S
 def _said(order: dict[str, Any]) -> str:
     one = order["pass"]
     head = f"{one['start_mm']:.1f} to {one['end_mm']:.1f} mm, lines {one['line_spacing_mm']:.3f} mm apart"
-    if order["outcome"] is None:
-        return f"{head}: {order['message'] or order['status']}"
-    outcome = order["outcome"]
-    doubt = f"; warning: {outcome['doubt']}" if outcome["doubt"] else ""
-    explored = (
-        f"; explored: {outcome['found_mm2']:.0f} mm² found of {outcome['expected_mm2']:.0f} mm² expected"
-        if outcome["expected_mm2"] >= 1.0
-        else ""
-    )
-    told = f"promised {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²"
-    return f"{head}: {told}{explored}{doubt}"
+    told = [order["status"]]
+    if (outcome := order["outcome"]) is not None:
+        told.append(f"promised {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²")
+        if outcome["expected_mm2"] >= 1.0:
+            told.append(f"explored: {outcome['found_mm2']:.0f} mm² found of {outcome['expected_mm2']:.0f} mm² expected")
+        if outcome["doubt"]:
+            told.append(f"warning: {outcome['doubt']}")
+    if order["status"] == "done" and order["reached_end"] is False:
+        told.append("ended before its end")
+    if order["message"]:
+        told.append(order["message"])
+    return f"{head}: {'; '.join(told)}"
 
 
 def _tell_plan(plan: dict[str, Any]) -> None:
     """The numbers as a table that fits a narrow terminal, and below it what each pass is for, uncut."""
     table = Table(title="Recommended passes", title_justify="left")
-    for name in ("#", "from mm", "to mm", "spacing", "lines", "s", "gain mm²", "mm²/s"):
-        table.add_column(name, justify="right")
+    for name in ("pass", "from mm", "to mm", "spacing", "lines", "s", "gain mm²", "mm²/s"):
+        table.add_column(name, justify="right", no_wrap=True)
     for one in plan["passes"]:
         table.add_row(
             str(one["number"]), f"{one['start_mm']:.1f}", f"{one['end_mm']:.1f}", f"{one['line_spacing_mm']:.3f}",

@@ -8,14 +8,23 @@ from typing import Annotated, Any
 
 import httpx
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from scanner_service.api.keys import read_local_key
 from scanner_service.commands.serve import DEFAULT_DATA, Data
-from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json
+from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json, tell_regions
 from scanner_service.sessions.stored import named_session
 
+_ASKED = {
+    "density_per_mm2": "{:g} points/mm²",
+    "line_spacing_mm": "lines {:g} mm apart at most",
+    "chord_error_mm": "chord error {:g} mm at most",
+    "incidence_deg": "incidence {:g}° at most",
+    "noise_mm": "noise {:g} mm at most",
+    "coverage_share": "coverage {:.1%}",
+}
 sessions_app = typer.Typer(
     help="The sessions of a running service: list, show with the ledger of losses, open, pause, resume, stop, delete.",
     no_args_is_help=True,
@@ -85,13 +94,15 @@ def list_command(
         if as_json:
             show_json(found)
             return
-        table = Table()
-        for name, justify in (("id", "left"), ("name", "left"), ("state", "left"), ("created", "left")):
-            table.add_column(name, justify=justify)  # type: ignore[arg-type]
+        table = Table(box=SIMPLE_HEAD, pad_edge=False)  # the names alone may take more lines than one
+        table.add_column("id", no_wrap=True)
+        table.add_column("name", overflow="fold")
+        for name in ("state", "created"):
+            table.add_column(name, no_wrap=True)
         for name in ("lines", "points"):
-            table.add_column(name, justify="right")
+            table.add_column(name, justify="right", no_wrap=True)
         for row in found:
-            when = row["created"][:16].replace("T", " ")
+            when = row["created"][2:16].replace("T", " ")
             table.add_row(row["id"], row["name"], row["state"], when, f"{row['lines']:,}", f"{row['points']:,}")
         console.print(table)
 
@@ -116,31 +127,48 @@ def show_command(
         for text in (status["message"], status["notes"]):
             if text:
                 console.print(text, highlight=False)
-        console.print(ledger_table(status["losses"]["passes"]))
+        if status["coverage"] is not None:
+            tell_regions(ask(client, "GET", _path(session_id, "/regions"))["regions"])
+        console.print(_requirement_sentence(status), highlight=False, soft_wrap=True)
+        tell_ledger(status["losses"]["passes"])
 
 
-def ledger_table(passes: list[dict[str, Any]]) -> Table:
-    """The ledger as people read it: a row a pass, each of which adds up; reasons below each other."""
+def _requirement_sentence(status: dict[str, Any]) -> str:
+    """What is asked for, and whether the coverage asked for is reached."""
+    asked = status["requirement"]
+    told = [words.format(asked[name]) for name, words in _ASKED.items() if asked[name] is not None]
+    if asked["density_per_mm2"] is None:
+        told.insert(0, f"{asked['density_share']:.0%} of the lines' own density")
+    if asked["interest"] is not None:
+        told.append("in a region of interest")
+    named = "" if asked["preset"] is None else f"{asked['preset']}: "
+    reached = {True: "; it holds", False: f"; it has {status['coverage'] or 0.0:.1%}", None: ""}[status["holds"]]
+    return f"Requirement: {named}{', '.join(told)}{reached}"
+
+
+def tell_ledger(passes: list[dict[str, Any]]) -> None:
+    """The ledger as people read it: a row a pass, each of which adds up, and below them what was lost and why."""
     table = Table(title="Ledger, scanlines: sent = stored + under way + lost", title_justify="left")
-    table.add_column("pass", no_wrap=True)
-    for name in ("sent", "stored", "partial", "under way", "lost", "chunks lost"):
-        table.add_column(name, justify="right")
+    table.add_column("scanned pass", no_wrap=True)
+    for name in ("sent", "stored", "partial", "under way", "lost"):
+        table.add_column(name, justify="right", no_wrap=True)
     boots = {(account["device_id"], account["boot_id"]) for account in passes}
     devices = {device for device, _ in boots}
+    reasons = []
     for account in passes:
-        lines, chunks = account["lines"], account["chunks"]
-        name = f"{account['device_id']}  {account['pass_index']}"
+        lines, chunks = account["lines"], account["chunks"] or {"sent": 0, "lost": {}}
+        name = f"{account['device_id']} {account['pass_index']}"
         if len(boots) > len(devices):
-            name += f"\n  boot {account['boot_id']}"
-        lost_chunks = "–" if chunks is None else _with_reasons(chunks["lost"], f" of {chunks['sent']:,}")
+            name += f" boot {account['boot_id']}"
         counts = (f"{lines[kind]:,}" for kind in ("sent", "stored", "partial", "under_way"))
-        table.add_row(name, *counts, _with_reasons(lines["lost"]), lost_chunks)
-    return table
-
-
-def _with_reasons(lost: dict[str, int], rest: str = "") -> str:
-    reasons = "".join(f"\n{reason.replace('_', ' ')} {count:,}" for reason, count in lost.items())
-    return f"{sum(lost.values()):,}{rest}{reasons}"
+        table.add_row(name, *counts, f"{sum(lines['lost'].values()):,}")
+        for what, account_of in (("scanlines", lines), ("chunks", chunks)):
+            if sum(account_of["lost"].values()):
+                told = ", ".join(f"{n:,} {reason.replace('_', ' ')}" for reason, n in account_of["lost"].items() if n)
+                reasons.append(f"{name}: of {account_of['sent']:,} {what} lost: {told}")
+    console.print(table)
+    for reason in reasons:
+        console.print(reason, highlight=False, soft_wrap=True)
 
 
 @sessions_app.command("open")

@@ -6,7 +6,7 @@ import math
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn
@@ -216,15 +216,14 @@ def _by_reason(lost: Mapping[str, int]) -> str:
     return f" ({told})" if told else ""
 
 
-def regions_table(regions: list[dict[str, Any]], title: str) -> Table:
-    """The rescan regions as people read them."""
-    table = Table(title=title, title_justify="left")
-    for name, justify in (("#", "right"), ("reason", "left"), ("area mm²", "right"), ("measured /mm²", "right")):
-        table.add_column(name, justify=justify)  # type: ignore[arg-type]
-    for name in ("required /mm²", "priority"):
-        table.add_column(name, justify="right")
-    table.add_column("status")
-    table.add_column("remedy")
+def tell_regions(regions: Sequence[Mapping[str, Any]]) -> None:
+    """The rescan regions as people read them: a table that fits a narrow terminal, and below it what helps, uncut."""
+    table = Table(title="Rescan regions", title_justify="left")
+    table.add_column("#", justify="right")
+    table.add_column("reason", no_wrap=True)
+    for name in ("area mm²", "has /mm²", "needs /mm²", "priority"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("status", no_wrap=True)
     for region in regions:
         table.add_row(
             str(region["number"]),
@@ -234,9 +233,14 @@ def regions_table(regions: list[dict[str, Any]], title: str) -> Table:
             _number(region["required_per_mm2"]),
             f"{region['priority']:.2f}",
             str(region["status"]),
-            str(region["remedy"]),
         )
-    return table
+    if not regions:
+        console.print("No region needs another scan.")
+        return
+    console.print(table)
+    for remedy in dict.fromkeys(str(region["remedy"]) for region in regions):
+        named = ", ".join(str(region["number"]) for region in regions if region["remedy"] == remedy)
+        console.print(f"{named}: {remedy}", highlight=False, soft_wrap=True)
 
 
 def _number(value: float | None) -> str:

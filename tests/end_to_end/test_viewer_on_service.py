@@ -5,7 +5,7 @@ import io
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -15,14 +15,18 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+from drivers.scanline import Pose, Scanline
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
 from scanner_service.sessions.sources import ReplaySource
 from scanner_service.storage.record import Record
+from simulators.parts import plate
+from simulators.posed_rig import PosedScanner
 from tests.end_to_end.browsing import NEEDS_CHROMIUM, Page, chromium, wait
 from tests.end_to_end.running import ROOT
 from tests.unit.analysis.scans import surface_scan
+from tests.unit.rescan.passes.posed_scans import FROM_ABOVE, SCANNER
 
 pytestmark = NEEDS_CHROMIUM
 
@@ -97,7 +101,7 @@ def test_a_live_scan_is_seen_growing_and_ends_as_the_service_has_it(running: Any
     regions = regions_of(service, session_id)
     assert {region["reason"] for region in regions} >= {"shadow"}
     listed = [int(number) for number in page.tab.locator("#regions .number").all_text_contents()]
-    assert listed == [region["number"] for region in regions], "the most urgent first, as the service has them"
+    assert listed == [region["id"] for region in regions], "the most urgent first, as the service calls them"
     reasons = [text.lower() for text in page.tab.locator("#regions .reason").all_text_contents()]
     assert reasons == [region["reason"].replace("_", " ") for region in regions]
     assert sorted(page.number("outlined")) == sorted(listed)
@@ -249,3 +253,90 @@ def test_a_record_that_is_dropped_on_the_page_is_played_and_shown(running: Any, 
     page.until("document.querySelector('#message').textContent.includes('none of the kinds that are read')")
     assert [complaint for complaint in page.complaints if "422" not in complaint] == []
     assert page.tab.evaluate("viewer.session") == shown
+
+
+def push(service: Any, session_id: str, lines: Iterable[Scanline]) -> None:
+    """Send the scanlines as a client with a scanner in its hand does."""
+    told = [
+        {
+            "pass_index": line.pass_index,
+            "line_index": line.line_index,
+            "points_mm": [point if np.isfinite(point).all() else None for point in line.points_mm.tolist()],
+            "laser_mm": line.laser_mm.tolist(),
+            "plane_normal": line.plane_normal.tolist(),
+            "travel": line.travel.tolist(),
+            "position_mm": line.position_mm,
+            "line_spacing_mm": line.line_spacing_mm,
+        }
+        for line in lines
+    ]
+    answer = service.client.post(f"/api/v1/sessions/{session_id}/scanlines", json={"lines": told})
+    assert answer.status_code == 200, answer.text
+
+
+def along(order: dict[str, Any]) -> Callable[[float], Pose]:
+    """Where the sensor is at each position of an ordered pass."""
+    one = order["pass"]
+    start, end = (np.array(one[name]["translation_mm"]) for name in ("start_pose", "end_pose"))
+    rotation, length = np.array(one["start_pose"]["rotation"]), one["end_mm"] - one["start_mm"]
+    return lambda at_mm: Pose(rotation, start + (at_mm - one["start_mm"]) / length * (end - start))
+
+
+def test_what_is_asked_for_is_set_on_the_page_and_a_hand_is_guided_along_the_pass_that_it_needs(
+    running: Any, context: Any
+) -> None:
+    service, posed = running.service(), PosedScanner(SCANNER, plate().surface, np.random.default_rng(1))
+    session_id = service.create(kind="push")
+    service.start(session_id)
+    push(service, session_id, posed.scan(FROM_ABOVE.part_from_sensor, 4.0, 12.0, 0.5))
+    where = f"/api/v1/sessions/{session_id}"
+    assert service.client.post(f"{where}/stop").json()["requirement"]["density_per_mm2"] is None
+    optics = {"laser_mm": SCANNER.laser_mm.tolist(), "camera_mm": SCANNER.camera_mm.tolist(),
+              "range_mm": list(SCANNER.range_mm), "field_of_view_mm": SCANNER.field_of_view_mm,
+              "points_per_line": SCANNER.points_per_line}  # fmt: skip
+    rig = {"axis": "free_pose", "scanner": optics, "reach_low_mm": [-400] * 3, "reach_high_mm": [400] * 3}
+    assert service.client.put(f"{where}/rig", json=rig).status_code == 200
+
+    page = viewer_page(context, service)
+    page.until("viewer.points > 1000 && document.querySelector('#requirement-said').textContent !== ''")
+    assert page.text("#regions") == "No region needs another scan."
+    page.tab.click("#requirement-fold > summary")
+    page.tab.fill("#ask-noise_mm", "0.001")
+    page.tab.click("#requirement-apply")
+    page.until("document.querySelector('#why-noise_mm').textContent.includes('own noise')")
+    page.tab.fill("#ask-noise_mm", "much")
+    assert page.text("#why-noise_mm") == "This is no number."
+    page.tab.fill("#ask-noise_mm", "")
+    page.tab.fill("#ask-density_per_mm2", "24")
+    page.tab.fill("#ask-coverage_share", "90")
+    page.tab.click("#requirement-apply")
+    page.until("document.querySelector('#requirement-said').textContent.startsWith('24 points/mm² · coverage 90')")
+    page.until("document.querySelector('#requirement-holds').dataset.holds === 'false'")
+    page.until("viewer.regions > 0")
+    asked = service.status(session_id)["requirement"]
+    assert (asked["density_per_mm2"], asked["coverage_share"], asked["preset"]) == (24.0, 0.9, None)
+    assert sorted(page.number("outlined")) == sorted(region["id"] for region in regions_of(service, session_id))
+
+    page.tab.click("#find-passes")
+    for fate in ("cancelled", "running"):
+        page.tab.click("#passes .pass:first-child button:has-text('Accept')")
+        page.tab.click("#orders button:has-text('" + ("Cancel" if fate == "cancelled" else "Carry out") + "')")
+        page.until(f"document.querySelector('#orders .badge').textContent === '{fate}'")
+    first, order = service.client.get(f"{where}/pass-orders").json()["orders"]
+    assert (first["status"], order["status"]) == ("cancelled", "running")
+    lines = list(
+        posed.scan(along(order), order["pass"]["start_mm"], order["pass"]["end_mm"], order["pass"]["line_spacing_mm"])
+    )
+    push(service, session_id, lines[: len(lines) // 2])
+    page.until("document.querySelector('#guide .say').textContent.includes('mm to go')")
+    push(service, session_id, lines[len(lines) // 2 :])
+    page.tab.click("#stop")
+    page.until("document.querySelector('#orders .badge').textContent === 'done'")
+    page.until("document.querySelector('#guide').hidden")
+    done = service.client.get(f"{where}/pass-orders/{order['order']}").json()["outcome"]
+    assert done["reached_mm2"] > 0.7 * done["promised_mm2"] > 0
+    assert "promised" in page.text("#orders .pass:first-child").lower()
+    refused = service.client.get(f"{where}/pass-orders/{order['order']}/guidance")
+    assert (refused.status_code, "is done" in refused.json()["detail"]) == (409, True)
+    assert [complaint for complaint in page.complaints if "422" not in complaint and "409" not in complaint] == []
+    page.tab.close()

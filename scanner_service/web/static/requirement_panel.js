@@ -75,7 +75,7 @@ export class RequirementPanel {
   #corner(corner) {
     const inputs = AXES.map((axis) => {
       const name = `interest.${corner}.${axis}`;
-      const input = element("input", { type: "text", inputmode: "decimal", name, autocomplete: "off", "aria-label": `${corner === "low_mm" ? "lowest" : "highest"} ${axis}, mm`, "aria-describedby": "why-interest" });
+      const input = element("input", { type: "text", inputmode: "decimal", name, autocomplete: "off", placeholder: axis, "aria-label": `${corner === "low_mm" ? "lowest" : "highest"} ${axis}, mm`, "aria-describedby": "why-interest" });
       this.#inputs.set(name, input);
       return input;
     });

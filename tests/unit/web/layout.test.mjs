@@ -83,6 +83,9 @@ test("the headline counts what was lost for good, and no place without a return"
   assert.equal(headline({ points: { dropped: { dropout: 99 } }, lines: { refused: {} }, device: null }), "nothing lost");
   assert.equal(headline({ lines: { conflicts: 1, refused: {} }, device: null }), "1 scanline lost");
   assert.equal(headline(null), "");
+  const pass = (partial, lost) => ({ lines: { sent: 9, stored: 9, partial, lost } });
+  assert.equal(headline({ lines: { refused: {} }, passes: [pass(2, {}), pass(1, { outside_pass: 40 })], device: null }), "3 scanlines partial");
+  assert.equal(headline({ lines: { refused: {} }, passes: [pass(1, { damaged: 2 }), pass(0, { record_busy: 1 })], device: null }), "3 scanlines lost, 1 scanline partial");
 });
 
 test("a file's account and a tally of a shape unknown here are told too", () => {

@@ -1,0 +1,65 @@
+// Laws of the requirement form: what is told asks for itself, presets are known again, refusals find their fields.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+const { inWords, presetOf, reached, refusalsByField, requestOf, textsOf } = await import("../../../scanner_service/web/static/requirement_form.js");
+const { fate, served } = await import("../../../scanner_service/web/static/passes_panel.js");
+const { opening } = await import("../../../scanner_service/web/static/numbers.js");
+
+const STANDARD = { preset: "standard", density_per_mm2: null, density_share: 0.5, line_spacing_mm: null, chord_error_mm: null, finest_line_spacing_mm: 0.05, incidence_deg: null, noise_mm: null, coverage_share: 0.95, interest: null };
+const FINE = { ...STANDARD, preset: "fine", line_spacing_mm: 0.15, chord_error_mm: 0.005, incidence_deg: 60, coverage_share: 0.99 };
+const PRESETS = { standard: STANDARD, fine: FINE };
+const asked = (told) => Object.fromEntries(Object.entries(told).filter(([name, value]) => name !== "preset" && value !== null));
+
+test("what the service tells fills the form, and the form asks for just that", () => {
+  const box = { low_mm: [-1.5, 0, 2], high_mm: [20, 30.25, 40] };
+  for (const told of [STANDARD, FINE, { ...FINE, density_per_mm2: 12.5, noise_mm: 0.0123, interest: box }]) {
+    assert.deepEqual(requestOf(textsOf(told)), { body: asked(told), refused: {} });
+  }
+  for (let share = 1; share <= 100; share += 1) assert.equal(requestOf(textsOf({ ...STANDARD, coverage_share: share / 100 })).body.coverage_share, share / 100);
+});
+
+test("a preset is known by its values, whatever its fields were filled by", () => {
+  for (const [name, told] of Object.entries(PRESETS)) assert.equal(presetOf(requestOf(textsOf(told)).body, PRESETS), name);
+  assert.equal(presetOf(requestOf({ ...textsOf(FINE), noise_mm: "0.02" }).body, PRESETS), null);
+  assert.equal(presetOf(requestOf({ ...textsOf(FINE), line_spacing_mm: "" }).body, PRESETS), null);
+});
+
+test("what is no number, and a box that is not whole, is refused beside its field; nothing is guessed", () => {
+  const { body, refused } = requestOf({ ...textsOf(STANDARD), noise_mm: "much", line_spacing_mm: "0,25", "interest.low_mm.x": "3" });
+  assert.deepEqual(Object.keys(refused), ["noise_mm", "interest"]);
+  assert.equal(body.line_spacing_mm, 0.25);
+  assert.ok(!("interest" in body) && !("noise_mm" in body));
+});
+
+test("a refusal stands beside the fields that it names, or below the form", () => {
+  const message = "noise_mm asks for at most 0.005 mm";
+  assert.deepEqual(refusalsByField({ message, body: { fields: ["noise_mm"] } }), { noise_mm: message });
+  assert.deepEqual(refusalsByField({ message, body: { errors: [{ at: "body.interest.low_mm.0", message: "a" }, { at: "body.density_per_mm2", message: "b" }] } }), { interest: "a", density_per_mm2: "b" });
+  for (const body of [null, {}, { fields: ["preset"] }]) assert.deepEqual(refusalsByField({ message, body }), { "": message });
+});
+
+test("what is asked for, and whether it is reached, reads in one line", () => {
+  assert.equal(inWords(STANDARD), "standard: 50 % of the lines' density · coverage 95 %");
+  assert.equal(inWords({ ...FINE, preset: null, density_per_mm2: 12 }), "12 points/mm² · lines 0.15 mm · chord 0.005 mm · incidence 60° · coverage 99 %");
+  assert.equal(reached({ requirement: STANDARD, coverage: null, holds: null }), "not known yet");
+  assert.match(reached({ requirement: STANDARD, coverage: 0.97, holds: true }), /^holds: 97\.0/);
+  assert.match(reached({ requirement: STANDARD, coverage: 0.26, holds: false }), /^26\.0.% of 95\.0.%$/);
+  assert.equal(reached({ requirement: { ...STANDARD, coverage_share: null }, coverage: 0.9, holds: null }), "");
+});
+
+test("messages begin with a capital, names are left as they are", () => {
+  assert.equal(opening("the scanner is gone"), "The scanner is gone");
+  assert.equal(opening("first turn the part"), "First turn the part");
+  for (const named of ["bun000.ply has no points", "noise_mm asks for less", "part: it cannot be read", "ttyUSB0 is gone", "3 sessions are open", ""]) assert.equal(opening(named), named);
+});
+
+test("a pass names its regions as the list does, an order what became of it", () => {
+  const serves = [{ region: 7 }, { region: 3 }, { region: null }];
+  assert.equal(served({ serves }), "regions 7, 3 and unseen surface");
+  assert.equal(served({ serves: serves.slice(0, 1) }), "region 7");
+  assert.equal(fate({ status: "accepted", message: null, outcome: null, reached_end: false }), "");
+  assert.equal(fate({ status: "done", message: null, outcome: { promised_mm2: 12, reached_mm2: 4 }, reached_end: false }), "promised 12, reached 4 mm²; ended before its end");
+  assert.equal(fate({ status: "failed", message: "the port is gone", outcome: null, reached_end: false }), "the port is gone");
+});
