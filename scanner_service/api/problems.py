@@ -22,6 +22,13 @@ from starlette.websockets import WebSocket
 MEDIA_TYPE = "application/problem+json"
 MAX_ERRORS_TOLD = 20
 _MAX_TEXT = 300
+_WORDS = {
+    "Field required": "is missing",
+    "Extra inputs are not permitted": "is not known here: leave it out",
+    "Value error, ": "is refused: ",
+    "Input tag ": "is of no known kind: ",
+    **{f"{what} should ": "must " for what in ("Input", "String", "List", "Tuple", "Value", "Data")},
+}
 
 _log = logging.getLogger("scanner_service.api")
 
@@ -160,10 +167,12 @@ def _from_validation(connection: HTTPConnection, error: Exception) -> Response:
     if any(fault.get("type") == "json_invalid" for fault in faults):
         return problem_response(MALFORMED_JSON, f"The body is not JSON at {_place(faults[0])}; send one JSON value.")
     told = [
-        {"at": _place(fault), "message": _short(str(fault.get("msg", ""))), "code": str(fault.get("type", ""))}
+        {"at": _place(fault), "message": _short(_said(str(fault.get("msg", "")))), "code": str(fault.get("type", ""))}
         for fault in faults[:MAX_ERRORS_TOLD]
     ]
-    first = f"{told[0]['at']}: {told[0]['message']}" if told else INVALID_REQUEST.title
+    first = f"{told[0]['at']} {told[0]['message']}" if told else INVALID_REQUEST.title
+    if len(faults) > 1:
+        first += f"; {len(faults) - 1} more {'things are' if len(faults) > 2 else 'thing is'} wrong with the request"
     return problem_response(INVALID_REQUEST, first, {"errors": told, "error_count": len(faults)})
 
 
@@ -174,6 +183,14 @@ def _unknown(connection: HTTPConnection, error: Exception) -> Response:
     told = str(error) if isinstance(error, ResponseValidationError) else ""
     _log.error("%s %s failed: %s %s", method, connection.scope.get("path"), type(error).__name__, told)
     return problem_response(INTERNAL, "The service failed on this request; its log says where. Nothing was confirmed.")
+
+
+def _said(message: str) -> str:
+    """What the checker of the schema says, as the rest of a sentence that begins with the place."""
+    for begins, said in _WORDS.items():
+        if message.startswith(begins):
+            return said + message.removeprefix(begins)
+    return f"is refused: {message}"
 
 
 def _place(fault: Mapping[str, object]) -> str:

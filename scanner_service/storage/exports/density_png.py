@@ -3,6 +3,7 @@
 Only matplotlib's objects are used, on the Agg canvas: no global state, so several threads may draw at once.
 """
 
+import textwrap
 from collections.abc import Callable, Sequence
 from functools import cache
 from io import BytesIO
@@ -33,6 +34,9 @@ _INK = "#222222"
 _DOWN = np.array([0.0, 0.0, -1.0])
 _PIXELS = 900
 _LABELS = 60
+_LEAST_REACHES = 12.0
+"""The picture is at least so many times as wide and high as the reach of one point."""
+
 # Dense is blue and sparse is red, by way of yellow and not of plain green, which some cannot tell from red.
 _BLUE_RED = LinearSegmentedColormap.from_list(
     "blue-red", ["#b2182b", "#ef6548", "#fdd870", "#c7e9b4", "#67a9cf", "#2166ac", "#08306b"]
@@ -80,7 +84,7 @@ def density_figure(
     top_per_mm2: float | None = None,
     lettered: bool = False,
 ) -> Figure:
-    """Draw the density of the surface seen along `direction`; 11 inches wide, at most 8.25 high, at `dpi`.
+    """Draw the density of the surface seen along `direction`; at most 11 inches wide and 8.25 high, at `dpi`.
 
     The scale is absolute, in points per mm², from 0 to the 98th percentile of the judged points. Points that are not
     reliable or not settled are grey. Regions are outlined with a line style for each reason, and numbered.
@@ -102,10 +106,7 @@ def density_figure(
         raise ValueError(f"colours are viridis or blue-red, not {colours!r}")
     view = view_along(direction)
     raster = rasterise(snapshot, view, _PIXELS) if len(snapshot) else None
-    height = (
-        8.25 if raster is None else float(np.clip(8.3 * raster.seen.shape[0] / raster.seen.shape[1] + 1.7, 4.2, 8.25))
-    )
-    figure = Figure(figsize=(11, height), dpi=dpi, facecolor="white", layout="constrained")
+    figure = Figure(figsize=_size_inches(raster), dpi=dpi, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)  # makes itself the figure's canvas
     grid = figure.add_gridspec(1, 2, width_ratios=[1, 0.11])
     part, scale = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
@@ -118,13 +119,36 @@ def density_figure(
         _surface(part, raster, colour_map, top)
         shown = _outlines(part, regions, view)
         _labels(part, regions, view, letters_of if lettered else str)
-        _legend(figure, part, raster, shown, regions)
+        _legend(figure, raster, shown, regions)
     else:
         part.text(0.5, 0.5, "no points yet", transform=part.transAxes, ha="center", color=_INK, fontsize=14)
         part.set_xticks([])
         part.set_yticks([])
-    _scale(scale, densities, colour_map, top, required_per_mm2)
+    if len(densities):
+        _scale(scale, densities, colour_map, top, required_per_mm2)
+    else:
+        scale.set_axis_off()  # a scale of which nothing has a colour
     return figure
+
+
+def _size_inches(raster: DensityRaster | None) -> tuple[float, float]:
+    """Width and height of a picture about what is drawn, with room for title, legend and scale."""
+    if raster is None:
+        return 7.0, 4.2
+    left, right, bottom, upper = _frame_mm(raster)
+    ratio = (right - left) / (upper - bottom)
+    return float(np.clip(6.5 * ratio + 2.7, 6.5, 11.0)), float(np.clip(8.3 / ratio + 1.7, 3.9, 8.25))
+
+
+def _frame_mm(raster: DensityRaster) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top of what is drawn: the surface and a margin; a few points stay small in it."""
+    left, right, bottom, upper = raster.extent_mm
+    margin = 0.03 * max(right - left, upper - bottom)
+    wide, tall = (
+        max(0.5 * size + margin, 0.5 * _LEAST_REACHES * raster.reach_mm) for size in (right - left, upper - bottom)
+    )
+    x, y = 0.5 * (left + right), 0.5 * (bottom + upper)
+    return x - wide, x + wide, y - tall, y + tall
 
 
 def density_png(
@@ -152,7 +176,8 @@ def _title(figure: Figure, session_name: str, when: str, coverage: float, snapsh
         facts.insert(0, f"observed coverage {100 * coverage:.1f} %")
     if when:
         facts.append(when)
-    title = figure.suptitle(drawable(session_name), fontsize=15, fontweight="bold", color=_INK, fontfamily=_FONT)
+    lines = textwrap.wrap(drawable(session_name), int(7.5 * figure.get_figwidth()), max_lines=2, placeholder=" …")
+    title = figure.suptitle("\n".join(lines), fontsize=15, fontweight="bold", color=_INK, fontfamily=_FONT)
     title.set_parse_math(False)
     second = figure.axes[0].set_title(drawable("  ·  ".join(facts)), fontsize=10, color="#555555", fontfamily=_FONT)
     second.set_parse_math(False)
@@ -189,9 +214,9 @@ def _surface(axes: Axes, raster: DensityRaster, colour_map: Colormap, top: float
         interpolation="nearest",
         zorder=2,
     )
-    margin = 0.03 * max(right - left, upper - bottom)
-    axes.set_xlim(left - margin, right + margin)
-    axes.set_ylim(bottom - margin, upper + margin)
+    frame = _frame_mm(raster)
+    axes.set_xlim(frame[:2])
+    axes.set_ylim(frame[2:])
 
 
 def _rgba(colour: str) -> tuple[float, float, float, float]:
@@ -264,9 +289,7 @@ def _reason(region: OutlinedRegion) -> str:
     return str(getattr(region.reason, "label", region.reason))
 
 
-def _legend(
-    figure: Figure, axes: Axes, raster: DensityRaster, shown: dict[str, int], regions: Sequence[OutlinedRegion]
-) -> None:
+def _legend(figure: Figure, raster: DensityRaster, shown: dict[str, int], regions: Sequence[OutlinedRegion]) -> None:
     keys: list[Line2D | Patch] = [Patch(facecolor=_NOT_JUDGED, label="not judged (unreliable or not settled)")]
     for reason, count in shown.items():
         style = _STYLES.get(reason, _OTHER_STYLE)
@@ -275,7 +298,7 @@ def _legend(
     legend = figure.legend(
         handles=keys,
         loc="outside lower center",
-        ncols=min(len(keys), 4),
+        ncols=min(len(keys), 4 if figure.get_figwidth() > 9.0 else 2),
         frameon=False,
         fontsize=9,
         handlelength=3.4,
@@ -286,9 +309,8 @@ def _legend(
     remark = f"pixel {raster.pixel_mm:.2g} mm; each shows points within {raster.reach_mm:.2g} mm"
     if len(regions) > _LABELS:
         remark += f"; the {_LABELS} most urgent of {len(regions)} regions are named"
-    axes.text(
-        0.995, 0.008, remark, transform=axes.transAxes, ha="right", va="bottom", fontsize=7, color="#777777", zorder=6
-    )
+    legend.set_title(remark, prop={"size": 7})
+    legend.get_title().set_color("#777777")
 
 
 def _scale(axes: Axes, densities: Float64Array, colour_map: Colormap, top: float, required: float) -> None:

@@ -73,7 +73,21 @@ def test_a_validation_error_names_the_place_and_never_the_value(http: httpx.Clie
     assert response.status_code == 422
     assert [error["at"] for error in document["errors"]] == ["body.line_spacing_mm", "body.points.1"]
     assert document["error_count"] == 2
+    assert document["detail"].startswith("body.line_spacing_mm must be a valid number")
+    assert document["detail"].endswith("; 1 more thing is wrong with the request")
     assert "secret" not in response.text
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ({}, "body.line_spacing_mm is missing"),
+        ({"line_spacing_mm": True, "points": 3}, "body.points must be a valid list"),
+        ({"line_spacing_mm": 1, "colour": 2}, "body.colour is not known here: leave it out"),
+    ],
+)
+def test_a_validation_error_is_one_sentence(http: httpx.Client, body: object, said: str) -> None:
+    assert http.post("/api/v1/lines", json=body).json()["detail"] == said
 
 
 @pytest.mark.parametrize(
