@@ -153,6 +153,12 @@ class StandIn:
             problem = {"type": "about:blank", "title": "Conflict", "status": 409, "detail": "the stage is still moving"}
             return JSONResponse(problem, 409, media_type="application/problem+json")
 
+        async def orders(_: Request) -> Response:
+            return JSONResponse({"orders": []})
+
+        async def loop(_: Request) -> Response:
+            return JSONResponse({"loop": None})
+
         async def export(request: Request) -> Response:
             return PlainTextResponse(f"the file {request.path_params['file']}")
 
@@ -161,6 +167,8 @@ class StandIn:
                 Route("/", page),
                 Mount("/static", StaticFiles(directory=STATIC_DIR)),
                 Route(base, listing),
+                Route(f"{base}/{{id}}/pass-orders", orders),
+                Route(f"{base}/{{id}}/rescan", loop),
                 Route(f"{base}/{{id}}/{{verb:str}}", command, methods=["POST"]),
                 Route(f"{base}/{{id}}/export/{{file}}", export),
                 WebSocketRoute(f"{base}/{{id}}/live", self.live),
@@ -431,7 +439,7 @@ def colour_at(page: Page, x: float, y: float) -> tuple[int, ...]:
 def test_a_refused_command_is_told_in_the_service_s_own_words(page: Page, host: Host) -> None:
     all_arrived(page, host)
     page.tab.click("#stop")
-    page.until("document.querySelector('#message').textContent === 'the stage is still moving'")
+    page.until("document.querySelector('#message').textContent === 'The stage is still moving'")
     assert host.service.commands == ["stop"]
 
 

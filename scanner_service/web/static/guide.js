@@ -1,7 +1,7 @@
 // Guides a hand along a pass: a card above the picture that says where, which way and how fast; plans nothing.
 
 import { element } from "./element.js";
-import { missing, opening, significant } from "./numbers.js";
+import { fixed, missing, opening, significant } from "./numbers.js";
 import { guidanceOf, ServiceRefusal } from "./service.js";
 
 const PERIOD_MS = 400;
@@ -45,7 +45,7 @@ export class Guide {
   #draw(order, said, told) {
     const length = Math.abs(order.pass.end_mm - order.pass.start_mm);
     const share = told && !missing(told.along_mm) ? Math.min(1, Math.max(0, 1 - told.along_mm / length)) : null;
-    const figure = (name, value, unit) => element("div", {}, element("dt", {}, name), element("dd", {}, significant(value), element("span.unit", {}, unit)));
+    const figure = (name, value, unit) => element("div", {}, element("dt", {}, name), element("dd", {}, fixed(value, 1), element("span.unit", {}, unit)));
     this.place.replaceChildren(
       element("p.say", {}, opening(said)),
       ...(told

@@ -25,7 +25,7 @@ export const words = (key) => String(key).replaceAll("_", " ");
 export const sentence = (key) => words(key).replace(/^./, (first) => first.toUpperCase());
 
 // A message with a capital at its beginning, unless it begins with a name: of a file, a device, a field.
-export const opening = (text) => text.replace(/^[a-z](?=[a-z]*[ ,])/, (first) => first.toUpperCase());
+export const opening = (text) => text.replace(/^[a-z](?=[a-z]*[ ,;])/, (first) => first.toUpperCase());
 
 export const plural = (count, one, many) => `${whole(count)} ${count === 1 ? one : many}`;
 

@@ -25,6 +25,7 @@ export class RequirementPanel {
       event.preventDefault();
       this.#send();
     });
+    byId("requirement-fold").addEventListener("toggle", () => Object.keys(this.#presets).length || this.#loadPresets());
     byId("requirement-undo").addEventListener("click", () => this.#fill(JSON.parse(this.#known)));
     byId("interest-part").addEventListener("click", () => this.#takeBox(this.partBox()));
     byId("interest-none").addEventListener("click", () => this.#takeBox(null));
@@ -39,7 +40,6 @@ export class RequirementPanel {
     byId("requirement-apply").disabled = byId("requirement-undo").disabled = true;
     this.#refuse({});
     this.onInterest(null);
-    if (!Object.keys(this.#presets).length) this.#loadPresets();
   }
 
   // A form that somebody is filling in is left alone.

@@ -51,6 +51,7 @@ test("what is asked for, and whether it is reached, reads in one line", () => {
 
 test("messages begin with a capital, names are left as they are", () => {
   assert.equal(opening("the scanner is gone"), "The scanner is gone");
+  assert.equal(opening("good; 13 mm to go"), "Good; 13 mm to go");
   assert.equal(opening("first turn the part"), "First turn the part");
   for (const named of ["bun000.ply has no points", "noise_mm asks for less", "part: it cannot be read", "ttyUSB0 is gone", "3 sessions are open", ""]) assert.equal(opening(named), named);
 });
