@@ -132,9 +132,9 @@ class ScanProgress:
         if coverage is None or math.isnan(coverage):
             share = "coverage –"
         elif status.get("coverage_kind", "observed") == "reference":
-            share = f"{coverage:.1%} of the nominal part covered"
+            share = f"coverage of the nominal part {coverage:.1%}"
         else:  # while a scan is under way nobody knows of the surface that is still to come
-            share = f"{coverage:.1%} of the surface seen{' so far' if done < 1.0 else ''} covered"
+            share = f"{'coverage so far' if done < 1.0 else 'observed coverage'} {coverage:.1%}"
         losses = status["losses"]
         facts = (
             f"{status['lines']:,} lines  {status['points_per_s']:,.0f} points/s  {share}  "
@@ -143,7 +143,7 @@ class ScanProgress:
         self._bar.update(self._task, completed=done, facts=facts)
         if not self._is_terminal and not self._quiet and done >= self._printed + 0.2:
             self._printed = done
-            errors.print(f"{done:4.0%}  {facts}", highlight=False)
+            errors.print(f"{done:4.0%}  {facts}", highlight=False, soft_wrap=True)
 
 
 @contextlib.contextmanager

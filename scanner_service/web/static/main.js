@@ -179,8 +179,16 @@ function followOrder(order) {
 }
 
 function showPass(pass) {
-  arrow.show(pass, session.origin, session.box ? [0, 1, 2].map((axis) => (session.box.low[axis] + session.box.high[axis]) / 2) : null);
+  arrow.show(pass, session.origin, pass && servedMiddle(pass));
   view.invalidate();
+}
+
+// The middle of the regions that a pass serves, relative to the origin; of all points where it serves none that is listed.
+function servedMiddle(pass) {
+  const served = new Set(pass.serves.map(({ region }) => region));
+  const centres = (session.regions ?? []).filter(({ id }) => served.has(id)).map(({ centroid_mm: at }) => at.map((value, axis) => value - session.origin[axis]));
+  if (!centres.length && session.box) centres.push([...session.box.low], [...session.box.high]);
+  return centres.length ? [0, 1, 2].map((axis) => centres.reduce((sum, centre) => sum + centre[axis], 0) / centres.length) : null;
 }
 
 function showInterest(box) {

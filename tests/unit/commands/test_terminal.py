@@ -57,9 +57,9 @@ def test_a_scan_that_lost_something_says_what_and_why_at_its_end():
 @pytest.mark.parametrize(
     ("kind", "progress", "coverage", "said"),
     [
-        ("observed", 0.22, 1.0, "100.0% of the surface seen so far covered"),
-        ("observed", 1.0, 0.5, "50.0% of the surface seen covered"),
-        ("reference", 0.22, 0.2, "20.0% of the nominal part covered"),
+        ("observed", 0.22, 1.0, "coverage so far 100.0%"),
+        ("observed", 1.0, 0.5, "observed coverage 50.0%"),
+        ("reference", 0.22, 0.2, "coverage of the nominal part 20.0%"),
         ("observed", 0.01, None, "coverage –"),
     ],
 )
