@@ -6,7 +6,14 @@ from fastapi import APIRouter, Depends, Request
 from pydantic import BaseModel, Field
 from starlette.responses import JSONResponse, RedirectResponse, Response
 
-from scanner_service.api.access import Access, Identity, clear_session_cookie, cookie_name, set_session_cookie
+from scanner_service.api.access import (
+    Access,
+    Identity,
+    LoginUnknown,
+    clear_session_cookie,
+    cookie_name,
+    set_session_cookie,
+)
 from scanner_service.api.keys import Role
 from scanner_service.api.scopes import public, require
 
@@ -37,8 +44,13 @@ def login_router() -> APIRouter:
     @router.get("/login", dependencies=[Depends(public)], include_in_schema=False)
     async def open_one_time_address(request: Request, token: str) -> Response:
         access: Access = request.app.state.access
-        value = access.redeem_login(token)
         response = RedirectResponse("/", status_code=303, headers={"Cache-Control": "no-store"})
+        try:
+            value = access.redeem_login(token)
+        except LoginUnknown:
+            if "text/html" not in request.headers.get("accept", ""):
+                raise
+            return response  # a person: the page knows whether the browser is signed in already, and says what to do
         set_session_cookie(response, request, value)
         return response
 

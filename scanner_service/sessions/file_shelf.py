@@ -1,4 +1,4 @@
-"""The folder of recorded scans that a service plays: what lies there, and what people bring; opens none for playing.
+"""The folder of recorded scans and nominal parts of a service: what lies there, and what people bring; plays none.
 
 A file that arrives is written beside, counted and looked at, and appears under its name only when it is whole.
 """
@@ -17,9 +17,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
+from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.sessions.errors import BudgetSpent, FileUnknown, NameTaken, SessionBusy, SourceUnusable
 from scanner_service.storage.errors import RecordError
 from scanner_service.storage.formats import FormatError, kind_of_content
+from scanner_service.storage.formats.reference_mesh import read_mesh
 from scanner_service.storage.reader import RecordReader
 
 MAX_FILE_BYTES = 2 << 30
@@ -29,8 +31,10 @@ RESERVE_BYTES = 1 << 30
 MOST_ARRIVING = 2
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._()+-]{0,119}")
 _TEXTS_AND_CLOUDS = (".asc", ".csv", ".e57", ".las", ".laz", ".pcd", ".ply", ".pts", ".tsv", ".txt", ".xyz")
-_ENDINGS = (*_TEXTS_AND_CLOUDS, ".raw", ".gz", ".db", ".sqlite", ".sqlite3")
+_MESHES = (".obj", ".stl")
+_ENDINGS = (*_TEXTS_AND_CLOUDS, ".raw", ".gz", ".db", ".sqlite", ".sqlite3", *_MESHES)
 _BESIDE = ("-wal", "-shm", "-journal")  # what SQLite leaves beside a record, and believes when it finds it there
+_MESH = "mesh"
 _HEAD_BYTES = 1 << 16
 _LOOK_EVERY_BYTES = 16 << 20
 
@@ -92,7 +96,7 @@ class FileShelf:
             if len(here) >= MOST_ARRIVING:
                 raise SessionBusy(f"{MOST_ARRIVING} files arrive already; send this one when they are here")
             self.check_room(declared_bytes or 0)
-            return Arrival(self, name, self._arriving / secrets.token_hex(8))
+            return Arrival(self, name, self._arriving / (secrets.token_hex(8) + Path(name).suffix.lower()))
 
     def check_room(self, more_bytes: int) -> None:
         """Raise BudgetSpent when so much more would take what is kept free."""
@@ -144,13 +148,18 @@ class Arrival:
         NameTaken : another file of that name is there.
         SourceUnusable : it is a record that cannot be read.
         FormatError : it is nothing that is read here.
+        ReferenceUnusable : it is a mesh that no scan can be measured against.
         """
         self._file.flush()
         os.fsync(self._file.fileno())
-        with self._beside.open("rb") as file:
-            kind = kind_of_content(file.read(_HEAD_BYTES), self._name)
-        if kind == "record":
-            _check_record(self._beside, self._name)
+        if self._name.lower().endswith(_MESHES):
+            kind = _MESH
+            _check_mesh(self._beside, self._name)
+        else:
+            with self._beside.open("rb") as file:
+                kind = kind_of_content(file.read(_HEAD_BYTES), self._name)
+            if kind == "record":
+                _check_record(self._beside, self._name)
         place = self._shelf.folder / self._name
         try:
             os.link(self._beside, place)  # unlike a rename it replaces nothing
@@ -187,11 +196,20 @@ def _look_at(path: Path) -> ShelfFile | None:
 
 
 def _kind(path: Path) -> str | None:
+    if path.name.lower().endswith(_MESHES):
+        return _MESH
     try:
         with path.open("rb") as file:
             return kind_of_content(file.read(_HEAD_BYTES), path.name)
     except (FormatError, OSError):
         return None
+
+
+def _check_mesh(path: Path, name: str) -> None:
+    try:
+        ReferenceSurface.of(read_mesh(path).corners_mm)
+    except FormatError as error:
+        raise type(error)(str(error).replace(path.name, name)) from error
 
 
 def _check_record(path: Path, name: str) -> None:

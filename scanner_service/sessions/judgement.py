@@ -97,10 +97,10 @@ class Judgement:
         """List, as soon as the verdict is the same, the regions that another playing of the same lines left."""
         self._left = left
 
-    def judge_by(self, requirement: Requirement) -> None:
+    def judge_by(self, requirement: Requirement, nominal: Nominal) -> None:
         """Ask for something else from the next verdict on; regions left of another requirement are not compared."""
         with self._judging, self._in_force:
-            self._requirement = requirement
+            self._requirement, self._nominal = requirement, nominal
             self._left, self._is_as_left = None, False
             self._finder = None  # it knows verdicts by what was asked before
 

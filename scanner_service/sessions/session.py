@@ -34,6 +34,7 @@ from scanner_service.sessions.status import Status
 from scanner_service.sessions.updates import Changes, PointPage, VerdictBook, changes_since, read_page
 from scanner_service.sessions.wires import Wires
 from scanner_service.sessions.withdrawals import SCAN_ENDED, WITHDRAWN
+from scanner_service.storage.formats.reference_mesh import ReferenceSpec
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import EventRow, SessionRow, Stored
 
@@ -65,6 +66,7 @@ class LiveSession:
         self._judgement = Judgement(
             self.engine, self.verdicts, self.settings.requirement(), nominal, self._chronicle.event, clock
         )
+        self._nominal = nominal
         self._time = ScanClock(clock)
         self._state = row.state
         self._message: str | None = None
@@ -217,15 +219,23 @@ class LiveSession:
         RecordError : the record does not take it; what was asked for before stays.
         """
         with self._asking:
-            before, settings = self.settings, replace(self.settings, target=requirement)
-            self._record.change_settings(self.row.session_id, settings.to_dict())  # durable first: it outlasts us
-            self.row, self.settings = replace(self.row, settings=settings.to_dict()), settings
-            self._judgement.judge_by(settings.requirement())
-            told = {"before": before.target.to_dict(), "now": settings.target.to_dict()}
-            self.event(REQUIREMENT_CHANGED, told)
-            self._judge()
-            if self._state in ("stopped", "failed"):  # what the scan left was of the verdict before
-                self._judgement.write_regions_down()
+            self._ask_for(replace(self.settings, target=requirement), self._nominal)
+
+    def measure_against(self, spec: ReferenceSpec | None, nominal: Nominal) -> None:
+        """Measure coverage against another nominal part from now on, None against the surface seen; as `judge_by`."""
+        with self._asking:
+            self._ask_for(replace(self.settings, reference=spec), nominal)
+
+    def _ask_for(self, settings: SessionSettings, nominal: Nominal) -> None:
+        before, now = self.settings.to_dict(), settings.to_dict()
+        self._record.change_settings(self.row.session_id, now)  # durable first: it outlasts us
+        self.row, self.settings, self._nominal = replace(self.row, settings=now), settings, nominal
+        self._judgement.judge_by(settings.requirement(), nominal)
+        changed = {name: {"before": before[name], "now": now[name]} for name in now if now[name] != before[name]}
+        self.event(REQUIREMENT_CHANGED, changed)
+        self._judge()
+        if self._state in ("stopped", "failed"):  # what the scan left was of the verdict before
+            self._judgement.write_regions_down()
 
     @property
     def can_pause(self) -> bool:

@@ -136,6 +136,29 @@ def test_what_is_asked_for_may_change_after_the_scan_and_everything_is_judged_an
     assert kinds[-1] == "regions_followed", "what a later opening goes on with is of the new verdict"
 
 
+def test_a_nominal_part_is_brought_and_measured_against_after_the_scan(
+    client: httpx.Client, folder: Path, scanned: str
+) -> None:
+    _write_stl(folder / "brought.stl", block())
+    content = (folder / "brought.stl").read_bytes()
+    kept = client.put("/api/v1/files/brought.stl", content=content)
+    assert (kept.status_code, kept.json()["kind"]) == (201, "mesh"), kept.text
+    for name, odd in (("cut.stl", content[:-20]), ("noise.obj", bytes(range(256)))):
+        refused = client.put(f"/api/v1/files/{name}", content=odd)
+        assert refused.status_code == 422 and name in refused.json()["detail"], refused.text
+    _write_stl(folder / "open.stl", block()[2:])
+    refused = client.put("/api/v1/files/open.stl", content=(folder / "open.stl").read_bytes())
+    assert refused.status_code == 422 and "watertight" in refused.json()["detail"]
+
+    before = client.get(f"{scanned}/requirement").json()
+    measured = client.put(f"{scanned}/reference", json={"file": "brought.stl"}).json()
+    assert (measured["coverage_kind"], measured["reference"]["file"]) == ("reference", "brought.stl")
+    assert 0 < measured["coverage"] < before["coverage"], "most of the block was never scanned"
+    assert "untouched" in {one["reason"] for one in client.get(f"{scanned}/regions").json()["regions"]}
+    assert client.put(f"{scanned}/reference", json={"file": "absent.stl"}).status_code == 422
+    assert client.delete(f"{scanned}/reference").json() == before
+
+
 def test_a_refused_requirement_names_its_fields_and_leaves_what_was_asked_for(
     client: httpx.Client, scanned: str
 ) -> None:

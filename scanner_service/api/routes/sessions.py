@@ -19,6 +19,7 @@ from scanner_service.api.schemas import (
     DeviceSourceIn,
     PassIn,
     PushSourceIn,
+    ReferenceIn,
     ReplaySourceIn,
     RequirementIn,
     RigSourceIn,
@@ -29,12 +30,13 @@ from scanner_service.api.scopes import require
 from scanner_service.rescan.presets import PRESETS
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SourceUnusable
-from scanner_service.sessions.references import open_reference
+from scanner_service.sessions.references import NO_NOMINAL, Nominal, open_reference
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec, ReplaySpec, RigSpec, SourceSpec
 from scanner_service.storage.database import is_sqlite
 from scanner_service.storage.formats.recording import ReadOptions
+from scanner_service.storage.formats.reference_mesh import ReferenceSpec
 from scanner_service.storage.rows import SessionRow
 
 router = APIRouter(prefix="/api/v1/sessions", tags=["sessions"])
@@ -221,10 +223,26 @@ def put_requirement(session: Session, body: RequirementIn) -> Response:
     return answer(_requirement_answer(session))
 
 
+@router.put("/{session_id}/reference", dependencies=[operator])
+def put_reference(request: Request, session: Session, body: ReferenceIn) -> Response:
+    """Measure coverage against a nominal part in the replay folder; the answer comes when all is judged anew."""
+    surface, spec = open_reference(ReferenceSpec(body.file, body.units), request.app.state.service.replay_dir)
+    session.measure_against(spec, Nominal(surface))
+    return answer(_requirement_answer(session))
+
+
+@router.delete("/{session_id}/reference", dependencies=[operator])
+def delete_reference(session: Session) -> Response:
+    """Measure coverage against the surface seen again."""
+    session.measure_against(None, NO_NOMINAL)
+    return answer(_requirement_answer(session))
+
+
 def _requirement_answer(session: LiveSession) -> dict[str, Any]:
     status = session.status()
     return {
         "requirement": requirement_told(session.settings.target),
+        "reference": session.row.settings.get("reference"),
         "holds": status.holds,
         "coverage": status.coverage,
         "coverage_kind": status.coverage_kind,

@@ -8,9 +8,11 @@ const holdsFiles = (event) => [...(event.dataTransfer?.types ?? [])].includes("F
 export class FileBringer {
   #busy = false;
 
-  // onSession(session) opens one; onNews(text) says how far it is; onRefusal(text) what was refused.
-  constructor({ onSession, onNews, onRefusal }) {
+  // onSession(session) opens one; onMesh(name) hears of a nominal part that was brought; onNews(text) says how far it is;
+  // onRefusal(text) what was refused.
+  constructor({ onSession, onMesh, onNews, onRefusal }) {
     this.onSession = onSession;
+    this.onMesh = onMesh;
     this.onNews = onNews;
     this.onRefusal = onRefusal;
     const sign = byId("drop");
@@ -43,6 +45,11 @@ export class FileBringer {
     try {
       this.onNews(`Bringing ${file.name}…`);
       const kept = await bringFile(file, (share) => this.onNews(`Bringing ${file.name}: ${Math.round(100 * share)} %`));
+      if (kept.kind === "mesh") {
+        this.onNews("");
+        this.onMesh(kept.name);
+        return;
+      }
       this.onNews(`Reading ${file.name}…`);
       const session = await createSession(file.name, { kind: "replay", file: kept.name });
       await startSession(session.id);

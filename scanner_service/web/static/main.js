@@ -11,6 +11,7 @@ import { listenToKeys } from "./keyboard.js";
 import { drawLegend } from "./legend.js";
 import { opening as capitalised, whole, words } from "./numbers.js";
 import { drawFigures, drawInspector, drawLosses, drawRegions } from "./panels.js";
+import { NominalPart } from "./nominal_part.js";
 import { PassArrow } from "./pass_arrow.js";
 import { PassesPanel } from "./passes_panel.js";
 import { pickPoint } from "./picking.js";
@@ -51,6 +52,7 @@ const guide = new Guide(byId("guide"), (share) => {
 });
 const passes = new PassesPanel({ trouble, scanned: () => session.open(session.id), onOrder: followOrder, onPass: (pass) => showPass(pass ?? ordered?.pass ?? null) });
 const requirement = new RequirementPanel({ onInterest: showInterest, partBox });
+const nominal = new NominalPart();
 const exports = new ExportMenu(byId("export-links"), byId("exports"));
 const picker = new SessionPicker({ onChoose: openSession, onMissing: (text) => notice(text), current: () => session.id });
 new FileBringer({
@@ -58,6 +60,7 @@ new FileBringer({
     byId("sessions").close();
     openSession(made);
   },
+  onMesh: (name) => (session.id ? nominal.use(name) : trouble("Open a session first: a nominal part is measured against in a session.")),
   onNews: (text) => (text ? notice(text) : explainEmptiness()),
   onRefusal: (text) => {
     byId("sessions").close();
@@ -110,6 +113,7 @@ function status() {
   drawFigures(byId("figures"), told, session.store, session.box);
   drawLosses(byId("losses"), byId("losses-count"), told.losses);
   requirement.status(told);
+  nominal.status(told);
   passes.status(told);
 }
 
@@ -260,6 +264,7 @@ function openSession(chosen) {
   session.open(chosen.id);
   passes.open(chosen.id);
   requirement.open(chosen.id);
+  nominal.open(chosen.id);
   explainEmptiness();
   overlay.show([], session.origin, view.radius);
   drawFigures(byId("figures"), null, session.store, null);

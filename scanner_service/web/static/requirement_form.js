@@ -32,8 +32,9 @@ export function requestOf(texts) {
   const number = (name, factor = 1) => {
     const text = texts[name].trim().replace(",", ".");
     const value = text === "" ? null : Number(text) / factor;
-    if (value !== null && !Number.isFinite(value)) refused[name] = "This is no number.";
-    return value;
+    if (value === null || Number.isFinite(value)) return value;
+    refused[name] = "This is no number.";
+    return null;
   };
   for (const { name, factor } of FIELDS) {
     const value = number(name, factor);

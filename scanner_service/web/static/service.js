@@ -20,7 +20,7 @@ async function answer(path, options) {
   }
   const body = await response.json().catch(() => null);
   if (response.ok) return body;
-  if (response.status === 401) throw new ServiceRefusal(401, "Not signed in. Open the one-time address that the service printed when it started.");
+  if (response.status === 401) throw new ServiceRefusal(401, "Not signed in. A one-time address holds once and for ten minutes: `scanner open` gives a fresh one.");
   throw new ServiceRefusal(response.status, body?.detail ?? body?.title ?? `The service answered ${response.status}.`, body);
 }
 
@@ -63,6 +63,9 @@ export const listPresets = () => answer("api/v1/sessions/presets");
 
 // Ask for something else; answered when everything is judged anew: {requirement, holds, coverage}.
 export const askFor = (id, requirement) => send(sessionPath(id, "requirement"), requirement, "PUT");
+
+// Measure coverage against a mesh in the service's folder, or against the surface seen when `file` is null.
+export const measureAgainst = (id, file, units) => (file === null ? answer(sessionPath(id, "reference"), { method: "DELETE" }) : send(sessionPath(id, "reference"), { file, units }, "PUT"));
 
 export const acceptPass = (id, number) => answer(sessionPath(id, `recommended-passes/${number}/accept`), { method: "POST" });
 

@@ -173,6 +173,9 @@ def test_the_one_time_address_logs_a_browser_in_once(service: Service) -> None:
         second = other.get(address)
         assert (second.status_code, second.json()["type"]) == (401, "/problems/login-unknown")
         assert "set-cookie" not in second.headers
+        shown = other.get(address, headers={"Accept": "text/html,*/*;q=0.8"})  # a person, whom the page tells the rest
+        assert (shown.status_code, shown.headers["location"], "set-cookie" in shown.headers) == (303, "/", False)
+        assert other.get("/api/v1/whoami").status_code == 401
 
 
 def test_the_cookie_is_out_of_reach_of_scripts_and_other_sites(service: Service) -> None:
