@@ -15,8 +15,8 @@ from scanner_service.rescan.passes.planner import plan_passes
 from scanner_service.rescan.passes.serving import Serving
 from scanner_service.rescan.passes.tried import TRIES
 from scanner_service.rescan.region import RegionStatus
-from scanner_service.sessions import pass_planning
 from scanner_service.rescan.requirement import Requirement
+from scanner_service.sessions import pass_planning
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.closed_loop import LoopLimits
 from scanner_service.sessions.errors import PassUnknown, SessionBusy

@@ -9,6 +9,7 @@ from drivers.rig_limits import AxisKind, RigLimits
 from drivers.scanline import Pose
 from scanner_service.rescan.passes.motion import TurningMotion
 from scanner_service.rescan.passes.reach import Reach
+from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.closed_loop import LoopLimits
 from scanner_service.sessions.pass_orders import PassStatus
@@ -55,7 +56,9 @@ def test_a_turntable_is_looped_until_its_part_is_scanned_all_around(tmp_path):
     setup = turntable_setup()
     with Record.open(tmp_path / "record.sqlite") as record:
         book = SessionBook(record)
-        session = book.create("block", PushSpec(), SessionSettings(density_per_mm2=DENSITY, max_points=400_000))
+        session = book.create(
+            "block", PushSpec(), SessionSettings(target=Requirement(density_per_mm2=DENSITY), max_points=400_000)
+        )
         posed = PosedScanner(SCANNER, box(LOW, HIGH), np.random.default_rng(1))
         scanned = []
 
