@@ -1,4 +1,4 @@
-"""What a session is told when it is created; only its requirement may change. Knows no device and no thread."""
+"""What a session is told when it is created; only what is asked for may change. Knows no device and no thread."""
 
 import math
 from collections.abc import Mapping

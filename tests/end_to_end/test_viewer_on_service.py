@@ -317,6 +317,19 @@ def test_what_is_asked_for_is_set_on_the_page_and_a_hand_is_guided_along_the_pas
     assert (asked["density_per_mm2"], asked["coverage_share"], asked["preset"]) == (24.0, 0.9, None)
     assert sorted(page.number("outlined")) == sorted(region["id"] for region in regions_of(service, session_id))
 
+    corners = [f"v {x} {y} {z}" for x in (-20, 20) for y in (0, 40) for z in (-6, 0)]
+    sides = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
+    mesh = {
+        "name": "plate.obj",
+        "mimeType": "model/obj",
+        "buffer": "\n".join(corners + [f"f {side}" for side in sides]).encode(),
+    }
+    page.tab.set_input_files("#nominal-file", mesh)
+    page.until("document.querySelector('#nominal-said').textContent === 'plate.obj, in mm'")
+    page.until("document.querySelector('#figures').textContent.includes('Coverage of the nominal part')")
+    page.tab.click("#nominal-none")
+    page.until("document.querySelector('#figures').textContent.includes('Observed coverage')")
+
     page.tab.click("#find-passes")
     for fate in ("cancelled", "running"):
         page.tab.click("#passes .pass:first-child button:has-text('Accept')")
