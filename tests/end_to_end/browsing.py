@@ -12,11 +12,12 @@ import pytest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 NEEDS_CHROMIUM = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
+PATIENCE_S = 120.0
 # the software renderer's own remarks on reading pixels
 _RENDERER_REMARKS = ("GPU stall", "GL Driver Message")
 
 
-def wait(condition: Callable[[], bool], seconds: float = 20) -> None:
+def wait(condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
     """Until the condition holds; fails loudly when it never does."""
     deadline = time.monotonic() + seconds
     while not condition():
@@ -51,6 +52,7 @@ class Page:
         tab = browser.new_page()
         if calm:
             tab.emulate_media(reduced_motion="reduce")
+        tab.set_default_timeout(1000 * PATIENCE_S)
         tab.set_viewport_size({"width": 1280, "height": 800})
         page = cls(tab, [])
         own = (f"http://{host}/", f"ws://{host}/")
@@ -73,7 +75,7 @@ class Page:
         """What an element says; empty when it is hidden."""
         return str(self.tab.text_content(selector)).strip() if self.tab.is_visible(selector) else ""
 
-    def until(self, expression: str, seconds: float = 20) -> None:
+    def until(self, expression: str, seconds: float = PATIENCE_S) -> None:
         """Until a JavaScript expression holds; not wait_for_function, since the page's policy forbids its eval."""
         wait(lambda: bool(self.tab.evaluate(expression)), seconds)
 

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import Colormap, LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.font_manager import findfont, get_font
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
@@ -309,7 +309,7 @@ def _legend(figure: Figure, raster: DensityRaster, shown: dict[str, int], region
     remark = f"pixel {raster.pixel_mm:.2g} mm; each shows points within {raster.reach_mm:.2g} mm"
     if len(regions) > _LABELS:
         remark += f"; the {_LABELS} most urgent of {len(regions)} regions are named"
-    legend.set_title(remark, prop={"size": 7})
+    legend.set_title(remark, prop=FontProperties(size=7))
     legend.get_title().set_color("#777777")
 
 
