@@ -74,11 +74,11 @@ def points_of(service: Any, session_id: str) -> dict[str, np.ndarray]:
     }
 
 
-def test_a_live_scan_is_seen_growing_and_ends_as_the_service_has_it(running: Any, context: Any) -> None:
+def test_a_live_scan_never_shrinks_and_ends_as_the_service_has_it(running: Any, context: Any) -> None:
     service, simulator = running.service(), running.simulator("step")
     page = viewer_page(context, service)
     page.until("document.querySelector('#notice').textContent.startsWith('No session yet')")
-    session_id = service.create(**device(simulator, line_rate_hz=30.0))
+    session_id = service.create(**device(simulator))
     service.start(session_id)
     page.until(f"viewer.session === '{session_id}'")
 
@@ -92,8 +92,8 @@ def test_a_live_scan_is_seen_growing_and_ends_as_the_service_has_it(running: Any
     wait(is_finished)
     states.append(page.text("#session-state"))  # the end may have come between the two looks
     assert seen == sorted(seen)
-    assert len(set(seen)) > 5, "the cloud did not grow before the eyes"
-    assert list(dict.fromkeys(state for state in states if state)) == ["scanning", "stopped"]
+    assert seen[-1] > 0
+    assert list(dict.fromkeys(state for state in states if state)) in (["scanning", "stopped"], ["stopped"])
     assert page.text("#connection-text") == "Finished"
 
     known = points_of(service, session_id)
@@ -145,7 +145,7 @@ def test_the_page_says_that_the_scanner_is_gone_and_stops_the_scan_when_it_is_ba
 ) -> None:
     link = tmp_path / "scanner-port"
     service, simulator = running.service(), running.simulator("step", "--link", link)
-    session_id = service.create(**device(simulator, port=str(link), line_rate_hz=20.0, rearm=True))
+    session_id = service.create(**device(simulator, port=str(link), line_rate_hz=6.0, rearm=True))
     service.start(session_id)
     page = viewer_page(context, service)
     page.until("viewer.points > 1000")
@@ -156,8 +156,10 @@ def test_the_page_says_that_the_scanner_is_gone_and_stops_the_scan_when_it_is_ba
     assert "waiting for it to return" in page.text("#message")
     picture, banner = (page.tab.locator(name).bounding_box() for name in ("#view", "#message"))
     assert picture["y"] < banner["y"] < picture["y"] + picture["height"] / 4, "the message stands above the picture"
+    before = page.number("points")
     simulator.tell("replug")
     page.until("document.querySelector('#message').hidden")
+    page.until(f"viewer.points > {before}")  # the cloud grows before the eyes
 
     page.tab.click("#stop")
     page.until("viewer.connection === 'finished'")
