@@ -40,7 +40,9 @@ export class NominalPart {
     this.#refuse("");
     byId("nominal-bring").disabled = true;
     try {
-      await measureAgainst(id, await bring(), byId("nominal-units").value);
+      const name = await bring();
+      this.#say(name === null ? "judging without it…" : `judging by ${name}…`);
+      await measureAgainst(id, name, byId("nominal-units").value);
     } catch (refusal) {
       this.#refuse(refusal.message);
     } finally {
