@@ -296,6 +296,18 @@ def page(browser: Any, host: Host) -> Iterator[Page]:
     made.tab.close()
 
 
+@pytest.fixture(scope="module")
+def shown(browser: Any) -> Iterator[tuple[Page, Host]]:
+    """A page on which everything has arrived, for those who only look; each of them chooses its view itself."""
+    host = Host(StandIn())
+    page = Page.opened(browser, host.url, f"127.0.0.1:{host.port}", calm=True)
+    all_arrived(page, host)
+    page.until("document.querySelector('#legend').hidden === false")
+    yield page, host
+    page.tab.close()
+    host.stop()
+
+
 def all_arrived(page: Page, host: Host) -> None:
     """Until every point has arrived and the regions are listed."""
     page.until(f"viewer.points === {len(host.service.cloud.xyz)} && viewer.regions === 2")
@@ -353,9 +365,8 @@ def test_an_update_that_does_not_follow_makes_the_page_ask_for_everything_again(
     tab.close()
 
 
-def test_keys_choose_front_right_and_top_views_and_fit(page: Page, host: Host) -> None:
-    all_arrived(page, host)
-    page.until("document.querySelector('#legend').hidden === false")
+def test_keys_choose_front_right_and_top_views_and_fit(shown: tuple[Page, Host]) -> None:
+    page, _ = shown
     page.settle()
     for key, axis, sign in (("1", 1, -1), ("3", 0, 1), ("7", 2, 1)):
         page.tab.keyboard.press(key)
@@ -374,9 +385,8 @@ def test_keys_choose_front_right_and_top_views_and_fit(page: Page, host: Host) -
     assert far > 1.5 * near
 
 
-def test_a_click_tells_coordinates_in_the_part_frame_that_lie_on_the_surface(page: Page, host: Host) -> None:
-    all_arrived(page, host)
-    page.until("document.querySelector('#legend').hidden === false")
+def test_a_click_tells_coordinates_in_the_part_frame_that_lie_on_the_surface(shown: tuple[Page, Host]) -> None:
+    page, host = shown
     page.tab.keyboard.press("7")
     page.settle()
     frame = page.tab.locator("#canvas").bounding_box()
@@ -391,8 +401,8 @@ def test_a_click_tells_coordinates_in_the_part_frame_that_lie_on_the_surface(pag
     assert "points/mm²" in page.tab.text_content("#inspector")
 
 
-def test_choosing_a_region_turns_the_view_about_it_and_names_its_remedy(page: Page, host: Host) -> None:
-    all_arrived(page, host)
+def test_choosing_a_region_turns_the_view_about_it_and_names_its_remedy(shown: tuple[Page, Host]) -> None:
+    page, _ = shown
     page.tab.click("#regions button:has-text('Steep')")
     page.settle()
     steep = np.array(REGIONS[0]["centroid_mm"]) - ORIGIN_MM
@@ -402,9 +412,8 @@ def test_choosing_a_region_turns_the_view_about_it_and_names_its_remedy(page: Pa
     assert sorted(page.tab.locator("#labels .region-label").all_text_contents()) == ["1", "2"]
 
 
-def test_blue_is_dense_red_is_sparse_and_grey_is_unreliable(page: Page, host: Host) -> None:
-    all_arrived(page, host)
-    page.until("document.querySelector('#legend').hidden === false")
+def test_blue_is_dense_red_is_sparse_and_grey_is_unreliable(shown: tuple[Page, Host]) -> None:
+    page, _ = shown
     page.tab.select_option("#scale", "bgyr")
     page.tab.click("summary:has-text('Display')")
     page.tab.uncheck("#shaded")
