@@ -221,7 +221,7 @@ def tell_regions(regions: Sequence[Mapping[str, Any]]) -> None:
     table = Table(title="Rescan regions", title_justify="left")
     table.add_column("#", justify="right")
     table.add_column("reason", no_wrap=True)
-    for name in ("area mm²", "has /mm²", "needs /mm²", "priority"):
+    for name in ("area mm²", "has", "needs", "priority"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("status", no_wrap=True)
     for region in regions:
@@ -229,8 +229,7 @@ def tell_regions(regions: Sequence[Mapping[str, Any]]) -> None:
             str(region["number"]),
             str(region["reason"]).replace("_", " "),
             f"{region['area_mm2']:.1f}",
-            _number(region["measured_per_mm2"]),
-            _number(region["required_per_mm2"]),
+            *_missed(region),
             f"{region['priority']:.2f}",
             str(region["status"]),
         )
@@ -243,5 +242,13 @@ def tell_regions(regions: Sequence[Mapping[str, Any]]) -> None:
         console.print(f"{named}: {remedy}", highlight=False, soft_wrap=True)
 
 
+def _missed(region: Mapping[str, Any]) -> tuple[str, str]:
+    """What a region has and what it needs, by the limit that it misses; by its density where no other is known."""
+    limit = region.get("limit")
+    if limit is None:
+        return f"{_number(region['measured_per_mm2'])} /mm²", f"{_number(region['required_per_mm2'])} /mm²"
+    return str(limit["has"]), str(limit["needs"])
+
+
 def _number(value: float | None) -> str:
-    return "–" if value is None or math.isnan(value) else f"{value:.1f}"
+    return "–" if value is None or math.isnan(value) else f"{value:.3g}"

@@ -76,9 +76,19 @@ class Limit:
     @property
     def text(self) -> str:
         """For people: what was measured, and what is the most or the least."""
-        space, bound = "" if self.unit == "°" else " ", "at most" if self.is_largest else "at least"
-        measured, required = (f"{value:.3g}{space}{self.unit}" for value in (self.measured, self.required))
+        bound = "at most" if self.is_largest else "at least"
+        measured, required = (_with_unit(value, self.unit) for value in (self.measured, self.required))
         return f"{_SAID[self.quantity]} {measured}, {bound} {required}"
+
+    @property
+    def has(self) -> str:
+        """What was measured, for a narrow table."""
+        return _with_unit(self.measured, self.unit.removeprefix("points"))
+
+    @property
+    def needs(self) -> str:
+        """The most or the least, for a narrow table."""
+        return f"{'≤' if self.is_largest else '≥'} {_with_unit(self.required, self.unit.removeprefix('points'))}"
 
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
@@ -89,6 +99,8 @@ class Limit:
             "unit": self.unit,
             "bound": "at most" if self.is_largest else "at least",
             "text": self.text,
+            "has": self.has,
+            "needs": self.needs,
         }
 
     @classmethod
@@ -185,6 +197,12 @@ def priority_of(deficit: float, area_mm2: float) -> float:
 def succession(agreeing: int, witnesses: int) -> float:
     """Trust in a verdict on which so many of the witnesses agree (Laplace's rule of succession, 1774)."""
     return (agreeing + 1.0) / (witnesses + 2.0)
+
+
+def _with_unit(value: float, unit: str) -> str:
+    if not np.isfinite(value):
+        return "–"
+    return f"{value:.3g}{'' if unit == '°' else ' '}{unit}"
 
 
 def _known(value: float) -> float | None:

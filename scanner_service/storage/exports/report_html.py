@@ -4,6 +4,7 @@ from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from html import escape
 
+from scanner_service.rescan.region import Limit, RescanRegion
 from scanner_service.storage.exports.density_png import density_png, scale_top_per_mm2
 from scanner_service.storage.exports.report_charts import chart, draw_coverage, draw_histogram, svg_of
 from scanner_service.storage.exports.report_content import ReportContent, Verdictful, shown
@@ -169,7 +170,7 @@ def _regions(content: ReportContent) -> list[str]:
     regions = content.final.report.regions
     if not regions:
         return ["<p>None: what was seen meets the requirement.</p>"]
-    heads = ("#", "reason", "remedy", "area mm²", "measured /mm²", "required /mm²", "priority", "at x, y, z mm")
+    heads = ("#", "reason", "remedy", "area mm²", "measured", "required", "priority", "at x, y, z mm")
     rows = [region_row(region) for region in regions[:MOST_REGIONS]]
     parts = [_table(heads, rows, numbers=(0, 3, 4, 5, 6))]
     if len(regions) > MOST_REGIONS:
@@ -196,25 +197,21 @@ def _before(content: ReportContent) -> list[str]:
     return parts
 
 
-def region_row(region: object) -> tuple[str, ...]:
+def region_row(region: RescanRegion) -> tuple[str, ...]:
     """A rescan region as the cells of a table."""
-    told = region.to_dict()  # type: ignore[attr-defined]
-    where = ", ".join(f"{value:.1f}" for value in told["centroid_mm"])
+    told = region.to_dict()
+    where = ", ".join(f"{value:.1f}" for value in region.centroid_mm)
+    limit = region.limit or Limit("density", region.measured_per_mm2, region.required_per_mm2, "points/mm²")
     return (
         str(told["number"]),
         str(told["reason"]).replace("_", " "),
         str(told["remedy"]),
-        f"{told['area_mm2']:,.1f}",
-        number(told["measured_per_mm2"]),
-        number(told["required_per_mm2"]),
-        f"{told['priority']:.2f}",
+        f"{region.area_mm2:,.1f}",
+        limit.has,
+        limit.needs,
+        f"{region.priority:.2f}",
         where,
     )
-
-
-def number(value: float | None) -> str:
-    """Three digits, or a dash for what is not known."""
-    return "–" if value is None else f"{value:.3g}"
 
 
 def percent(share: float) -> str:

@@ -152,8 +152,8 @@ class _Book:
             self.text("None: what was seen meets the requirement.")
             return
         self._table(
-            (("#", 0.35, True), ("reason", 0.85, False), ("remedy", 1.85, False), ("area mm²", 0.75, True),
-             ("measured", 0.7, True), ("required", 0.7, True), ("priority", 0.6, True), ("at x, y, z mm", 1.05, True)),
+            (("#", 0.35, True), ("reason", 0.85, False), ("remedy", 1.65, False), ("area mm²", 0.75, True),
+             ("measured", 0.8, True), ("required", 0.8, True), ("priority", 0.6, True), ("at x, y, z mm", 1.05, True)),
             [region_row(region) for region in regions[:MOST_REGIONS]],
         )  # fmt: skip
         if len(regions) > MOST_REGIONS:

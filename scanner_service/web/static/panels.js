@@ -49,6 +49,12 @@ export function drawLosses(place, count, losses) {
   place.replaceChildren(...(losses ? accounts(losses).map(tally) : [element("p.empty", {}, "Not known yet.")]));
 }
 
+// How far a limit is met, 0 to 1: of a density what there is of what is needed, of all else what is allowed of what there is.
+function shareOf({ measured, required, bound }) {
+  const [part, whole] = bound === "at most" ? [required, measured] : [measured, required];
+  return whole > 0 ? Math.min(1, part / whole) : 0;
+}
+
 export function drawRegions(place, count, regions, chosen, onChoose, status = null) {
   count.textContent = regions === null ? "" : whole(regions.length);
   if (!regions?.length) {
@@ -57,7 +63,8 @@ export function drawRegions(place, count, regions, chosen, onChoose, status = nu
   }
   const item = (region, said) => {
     const reason = reasonByKey(region.reason);
-    const share = region.required_per_mm2 > 0 ? Math.min(1, region.measured_per_mm2 / region.required_per_mm2) : 0;
+    const limit = region.limit ?? { measured: region.measured_per_mm2, required: region.required_per_mm2, unit: "points/mm²", bound: "at least", text: null };
+    const share = shareOf(limit);
     return element(
       "li",
       { "data-said": said },
@@ -67,10 +74,10 @@ export function drawRegions(place, count, regions, chosen, onChoose, status = nu
         element("span.number", {}, String(region.id)),
         element("span.reason", {}, sentence(reason.text), lineSample(reason)),
         element("span.area", {}, significant(region.area_mm2), element("span.unit", {}, "mm²")),
-        element("span.density", {}, `${significant(region.measured_per_mm2)} of ${significant(region.required_per_mm2)}`, element("span.unit", {}, "points/mm²")),
+        element("span.density", { title: limit.text }, `${significant(limit.measured)}, ${limit.bound} ${significant(limit.required)}`, element("span.unit", {}, limit.unit)),
         element("span.priority", {}, "priority ", significant(region.priority, 2)),
         region.status ? element(`span.status.${region.status}`, { title: region.history?.at(-1)?.why ?? null }, region.status) : null,
-        element("meter", { min: 0, max: 1, value: share, "aria-label": "measured share of the required density" }),
+        element("meter", { min: 0, max: 1, value: share, "aria-label": "how far what is required is met" }),
         region.remedy ? element("span.remedy", {}, region.remedy) : null,
       ),
     );

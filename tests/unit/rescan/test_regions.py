@@ -113,6 +113,8 @@ def test_what_a_region_fails_by_is_told_with_its_unit_and_which_way_it_fails() -
         "unit": "mm",
         "bound": "at most",
         "text": "scanlines on the surface apart by 0.6 mm, at most 0.524 mm",
+        "has": "0.6 mm",
+        "needs": "≤ 0.524 mm",
     }
     sparse = find_regions(snapshot_of(straight_down(flat, X, Y, 0.3)), Requirement(density_per_mm2=60.0)).regions[0]
     assert sparse.limit is not None and Limit.from_dict(sparse.limit.to_dict()) == sparse.limit
