@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 from scanner_service.analysis.method_analysis import METHOD_NAMES
 from scanner_service.cli import app
 
+ORIENTED = ("fixed_radius", "bivariate_quadric", "big_delaunay_balls")
 RNG = np.random.default_rng(5)
 BAD_CLOUDS = {
     "few": RNG.normal(size=(4, 3)),
@@ -31,8 +32,9 @@ def only_numbers(text):
 def test_every_method_answers_with_reasons_or_refuses_in_a_sentence(name, tmp_path):
     file, points = tmp_path / "cloud.xyz", BAD_CLOUDS[name]
     np.savetxt(file, points)
-    for number, method in enumerate((*METHOD_NAMES, *METHOD_NAMES)):
-        out, orient = tmp_path / f"{number}", ["--orient"] if number < len(METHOD_NAMES) else []
+    upwards = [(method, []) for method in METHOD_NAMES]
+    for number, (method, orient) in enumerate([*upwards, *((name, ["--orient"]) for name in ORIENTED)]):
+        out = tmp_path / f"{number}"
         arguments = ["analyse", file, "--method", method, "--units", "mm", "--out", out, *orient]
         found = CliRunner().invoke(app, [str(argument) for argument in arguments])
         if found.exit_code == 1:
