@@ -8,8 +8,8 @@ from tests.end_to_end.running import RunningService, RunningSimulator
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory):
-    """One service for all tests of a file that neither end it nor mind the sessions of others."""
+def shared_service(tmp_path_factory):
+    """One service for a file."""
     shared = RunningService(tmp_path_factory.mktemp("shared") / "data")
     yield shared
     shared.end()
@@ -17,20 +17,31 @@ def service(tmp_path_factory):
 
 @pytest.fixture
 def running(tmp_path):
-    """Start services (on one data folder) and simulators; all of them end with the test."""
-    with contextlib.ExitStack() as stack:
+    """Start services (on one data folder) and simulators; all of them end with the test, the services first."""
+    with contextlib.ExitStack() as simulators, contextlib.ExitStack() as services:
 
         class Starter:
             data = tmp_path / "data"
 
             def service(self):
                 service = RunningService(self.data)
-                stack.callback(service.end)
+                services.callback(service.end)
                 return service
 
             def simulator(self, *arguments):
                 simulator = RunningSimulator(*arguments)
-                stack.callback(simulator.end)
+                simulators.callback(simulator.end)
                 return simulator
 
         yield Starter()
+
+
+@pytest.fixture
+def service(running, shared_service):
+    """The service of the file, for tests that neither end it nor mind the sessions of others.
+
+    What a test leaves is stopped while its simulator still runs: a session that looked for a terminal which is gone
+    would open the next one of that number, which may be another test's.
+    """
+    yield shared_service
+    shared_service.stop_all()

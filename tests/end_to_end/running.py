@@ -60,6 +60,12 @@ class RunningService:
         answer = self.client.post(f"/api/v1/sessions/{session_id}/start")
         assert answer.status_code == 200, answer.text
 
+    def stop_all(self):
+        for session in self.client.get("/api/v1/sessions", params={"limit": 1000}).json()["sessions"]:
+            if session["state"] in ("created", "scanning", "paused"):
+                answer = self.client.post(f"/api/v1/sessions/{session['id']}/stop")
+                assert answer.status_code == 200, answer.text
+
     def status(self, session_id):
         answer = self.client.get(f"/api/v1/sessions/{session_id}")
         assert answer.status_code == 200, answer.text
