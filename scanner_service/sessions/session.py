@@ -446,13 +446,13 @@ class LiveSession:
         with self._lock:
             if self._state in ("stopped", "failed"):
                 return
+            self._time.stop()
             try:
                 self.engine.ask(lambda engine: engine.close_passes()).result()
+                # The account of a scan that is over is whole: the last commits are waited for, while there are any.
+                self.engine.ledger.wait_until_decided(0.0 if self._record.is_failing else _COMMIT_PATIENCE_S)
             except SessionError as error:
                 failure = failure or str(error)
-            self._time.stop()
-            # The account of a scan that is over is whole: the last commits are waited for, while there are any.
-            self.engine.ledger.wait_until_decided(0.0 if self._record.is_failing else _COMMIT_PATIENCE_S)
             self._held = False
             self._judge()
             self._chronicle.event(SCAN_ENDED, self.losses(), patience_s=5.0)

@@ -336,17 +336,17 @@ def test_what_is_asked_for_is_set_on_the_page_and_a_hand_is_guided_along_the_pas
     for fate in ("cancelled", "running"):
         page.tab.click("#passes .pass:first-child button:has-text('Accept')")
         page.tab.click("#orders button:has-text('" + ("Cancel" if fate == "cancelled" else "Carry out") + "')")
-        page.until(f"document.querySelector('#orders .badge').textContent === '{fate}'")
+        page.until(f"document.querySelector('#orders .badge')?.textContent === '{fate}'")
     first, order = service.client.get(f"{where}/pass-orders").json()["orders"]
     assert (first["status"], order["status"]) == ("cancelled", "running")
     lines = list(
         posed.scan(along(order), order["pass"]["start_mm"], order["pass"]["end_mm"], order["pass"]["line_spacing_mm"])
     )
     push(service, session_id, lines[: len(lines) // 2])
-    page.until("document.querySelector('#guide .say').textContent.includes('mm to go')")
+    page.until("document.querySelector('#guide .say')?.textContent.includes('mm to go')")
     push(service, session_id, lines[len(lines) // 2 :])
     page.tab.click("#stop")
-    page.until("document.querySelector('#orders .badge').textContent === 'done'")
+    page.until("document.querySelector('#orders .badge')?.textContent === 'done'")
     page.until("document.querySelector('#guide').hidden")
     done = service.client.get(f"{where}/pass-orders/{order['order']}").json()["outcome"]
     assert done["reached_mm2"] > 0.7 * done["promised_mm2"] > 0
