@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 
 from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
 from scanner_service.analysis.snapshot import MapSnapshot, RadiusRule, UInt8Array
-from scanner_service.rescan.frames import Frames, angle_and_depth
+from scanner_service.rescan.frames import Frames
 from scanner_service.rescan.stations import IntArray, Stations
 from scanner_service.rescan.strips import Strips, in_a_row
 
@@ -129,13 +129,6 @@ class Pairs:
     second: IntArray
     kind: UInt8Array
     is_down: BoolArray
-
-
-def fan_of(snapshot: MapSnapshot, stations: Stations, frames: Frames) -> Fan:
-    """Angle and depth of every point."""
-    group = stations.group[snapshot.line]
-    ray = snapshot.points_mm - snapshot.lines.laser_mm[snapshot.line]
-    return Fan(*angle_and_depth(ray, frames.along[group], frames.axis[group]))
 
 
 def column_of(fan: Fan, frames: Frames, rows: IntArray, group: IntArray) -> IntArray:
