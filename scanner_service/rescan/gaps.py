@@ -263,7 +263,7 @@ def _classified(
         goes_on[shift : len(goes_on) - 2 + shift] |= thrice
     goes_on |= np.isnan(off_tangent)  # no plane on either side: the middle of something steep
     kind = np.full(len(first), GapKind.HOLE, dtype=np.uint8)
-    near = near_range_end(snapshot, stations, strips, fan, geometry)
+    near = near_range_end(snapshot, strips, fan, geometry)
     kind[near[first] & near[second]] = GapKind.OUT_OF_RANGE
     # round a silhouette only the upper plane leads down, to something far below
     silhouette = (
@@ -334,9 +334,7 @@ def seen_by_others(
     return seen
 
 
-def near_range_end(
-    snapshot: MapSnapshot, stations: Stations, strips: Strips, fan: Fan, geometry: SensorGeometry | None
-) -> BoolArray:
+def near_range_end(snapshot: MapSnapshot, strips: Strips, fan: Fan, geometry: SensorGeometry | None) -> BoolArray:
     """(n,) True where a point stands near an end of the measurement range; all False without a geometry."""
     if geometry is None:
         return np.zeros(len(snapshot), dtype=bool)
