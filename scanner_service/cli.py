@@ -48,7 +48,7 @@ class CommandsWhenAsked(TyperGroup):
         module, name = COMMANDS[cmd_name].split(":")
         found = getattr(importlib.import_module(f"scanner_service.commands.{module}"), name)
         if not isinstance(found, typer.Typer):
-            alone = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False)
+            alone = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False, add_completion=False)
             alone.command(cmd_name)(found)
             return typer.main.get_command(alone)
         group = typer.main.get_group(found)

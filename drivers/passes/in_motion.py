@@ -13,7 +13,9 @@ from drivers.scanners.face import FreeRunningScanner
 from drivers.stages.unmoved import ConstantSpeed
 
 _BACK_S = 120.0
-_JUDGED_AFTER = 100
+_JUDGED_FROM, _JUDGED_AFTER = 6, 100
+"""Lines after which their spacing is judged: a pause of the program among fewer looks like their rate. And those after
+which it is given up, where the scanner's clock does not go on."""
 _TOLD_FACTOR, _REFUSED_FACTOR = 2.0, 10.0
 """How many times as far as ordered, or as near, lines on a conveyor may come before it is told, and before the order is
 nonsense."""
@@ -94,6 +96,8 @@ class MotionPass:
     def _judge_spacing(self, profiles: list[Profile]) -> None:
         """A conveyor goes at its own speed: refuse a spacing that is far finer than the one in which lines come."""
         self._seen += profiles
+        if len(self._seen) < _JUDGED_FROM:
+            return
         rate_hz = line_rate_of(self._seen)
         if rate_hz is None and len(self._seen) < _JUDGED_AFTER:
             return

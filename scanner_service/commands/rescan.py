@@ -141,9 +141,9 @@ def _served(one: dict[str, Any]) -> str:
     named = [str(item["region"]) for item in one["serves"] if item["region"] is not None]
     regions = f"region{'s' if len(named) > 1 else ''} {', '.join(named)}" if named else ""
     unseen = "unseen surface" if len(named) < len(one["serves"]) else ""
-    if one["explores_mm2"] > 0.5 * one["gain_mm2"]:
-        unseen += " (explores: most of what is expected may not be there)"
-    return " and ".join(filter(None, (regions, unseen))) or "nothing"
+    explores = one["explores_mm2"] > 0.5 * one["gain_mm2"]
+    served = " and ".join(filter(None, (regions, unseen))) or "nothing"
+    return f"{served} (explores: most of what is expected may not be there)" if explores else served
 
 
 def _tell_orders(orders: list[dict[str, Any]]) -> None:

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 
 from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
 from scanner_service.analysis.snapshot import MapSnapshot, RadiusRule, UInt8Array
-from scanner_service.rescan.frames import Frames, angle_and_depth
+from scanner_service.rescan.frames import Frames
 from scanner_service.rescan.stations import IntArray, Stations
 from scanner_service.rescan.strips import Strips, in_a_row
 
@@ -129,13 +129,6 @@ class Pairs:
     second: IntArray
     kind: UInt8Array
     is_down: BoolArray
-
-
-def fan_of(snapshot: MapSnapshot, stations: Stations, frames: Frames) -> Fan:
-    """Angle and depth of every point."""
-    group = stations.group[snapshot.line]
-    ray = snapshot.points_mm - snapshot.lines.laser_mm[snapshot.line]
-    return Fan(*angle_and_depth(ray, frames.along[group], frames.axis[group]))
 
 
 def column_of(fan: Fan, frames: Frames, rows: IntArray, group: IntArray) -> IntArray:
@@ -270,7 +263,7 @@ def _classified(
         goes_on[shift : len(goes_on) - 2 + shift] |= thrice
     goes_on |= np.isnan(off_tangent)  # no plane on either side: the middle of something steep
     kind = np.full(len(first), GapKind.HOLE, dtype=np.uint8)
-    near = near_range_end(snapshot, stations, strips, fan, geometry)
+    near = near_range_end(snapshot, strips, fan, geometry)
     kind[near[first] & near[second]] = GapKind.OUT_OF_RANGE
     # round a silhouette only the upper plane leads down, to something far below
     silhouette = (
@@ -341,9 +334,7 @@ def seen_by_others(
     return seen
 
 
-def near_range_end(
-    snapshot: MapSnapshot, stations: Stations, strips: Strips, fan: Fan, geometry: SensorGeometry | None
-) -> BoolArray:
+def near_range_end(snapshot: MapSnapshot, strips: Strips, fan: Fan, geometry: SensorGeometry | None) -> BoolArray:
     """(n,) True where a point stands near an end of the measurement range; all False without a geometry."""
     if geometry is None:
         return np.zeros(len(snapshot), dtype=bool)

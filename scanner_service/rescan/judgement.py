@@ -184,7 +184,7 @@ def judge(
         reason[noisy] = Reason.NOISY
     if geometry is not None:
         edge = ~np.isfinite(strips.width_mm).all(axis=1) | _line_ends(snapshot, strips)
-        near = near_range_end(snapshot, stations, strips, fan, geometry)
+        near = near_range_end(snapshot, strips, fan, geometry)
         reason[judged & edge & near] = Reason.OUT_OF_RANGE
     reason[(marks & Mark.OUT_OF_RANGE) > 0] = Reason.OUT_OF_RANGE
     reason[wall & ((reason == Reason.NONE) | (reason == Reason.ISOLATED))] = Reason.SHADOW

@@ -76,12 +76,11 @@ class Mirror:
                 self._put(rows, ask_between(partial(LiveMap.records, rows=rows)))
             self.version = news.version
 
-    def snapshot(self) -> MapSnapshot:
-        """The whole map as it was caught up with last, frozen; what is copied later does not change it."""
-        return self.changes()[0]
-
     def changes(self) -> tuple[MapSnapshot, npt.NDArray[np.int64]]:
-        """The same, and its rows (k,), rising, that are new or other than in the snapshot before."""
+        """The whole map as it was caught up with last, and its rows (k,), rising, that are new or other than before.
+
+        The map is frozen: what is copied later does not change it. "Before" is at the last call.
+        """
         assert self._latest is not None
         is_in = np.zeros(self._total, dtype=np.bool_)
         for part in self._changed:

@@ -15,6 +15,7 @@ from scanner_service.rescan.passes.outcome import reckon
 from scanner_service.rescan.passes.recommendation import Plan
 from scanner_service.rescan.passes.serving import EVERYTHING, Serving
 from scanner_service.rescan.passes.tried import Tried
+from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.closed_loop import LoopLimits, LoopState, run
 from scanner_service.sessions.errors import PassUnknown, SessionBusy, SessionError
@@ -52,6 +53,7 @@ class PassDesk:
         self._setup: RigSetup | None = None
         self._plan: Plan | None = None
         self._planned_for: tuple[object, ...] = ()  # what is served, and what is asked for
+        self._planned_against: ReferenceSurface | None = None  # the nominal part
         self._orders = OrderBook()
         self._tried = Tried.nothing()
         self._standing: Pose | None = None
@@ -250,16 +252,17 @@ class PassDesk:
         """
         while True:
             results = self._session.results() or self._session.fresh_results()
-            setup, wanted = self._setup_now(results), (serving, results.requirement, results.reference is not None)
+            setup, wanted, nominal = self._setup_now(results), (serving, results.requirement), results.nominal
             with self._lock:
                 known, changes = self._plan, self._changes
-                if known is not None and known.version == results.report.version and self._planned_for == wanted:
+                is_same = self._planned_for == wanted and self._planned_against is nominal
+                if known is not None and known.version == results.report.version and is_same:
                     return known, None
                 question = self._question(results, setup, serving)
             plan = question.answered()
             with self._lock:
                 if self._changes == changes:
-                    self._plan, self._planned_for = plan, wanted
+                    self._plan, self._planned_for, self._planned_against = plan, wanted, nominal
                     return plan, results
 
     def _begun(self, order: PassOrder, part_is_turned: bool) -> tuple[Results, RigSetup]:

@@ -36,7 +36,7 @@ class Results:
 
     `regions` are those of the report, followed through the session: with ids, status and history, by falling priority;
     `resolved` those that were mended. `reference` is the coverage of the nominal part, None without one, or as long as
-    there are too few points, or when `reference_refused` says why it cannot be told.
+    there are too few points, or when `reference_refused` says why it cannot be told; `nominal` is that part itself.
     """
 
     snapshot: MapSnapshot
@@ -47,6 +47,7 @@ class Results:
     resolved: tuple[RescanRegion, ...] = ()
     reference: ReferenceCoverage | None = None
     reference_refused: str | None = None
+    nominal: ReferenceSurface | None = None
 
     @property
     def verdict(self) -> Verdict:
@@ -134,6 +135,7 @@ def conclude(
         regions=tuple(replace(region, number=number) for number, region in enumerate(regions, start=1)),
         reference=measured,
         reference_refused=refused,
+        nominal=reference,
     )
 
 

@@ -124,6 +124,7 @@ class Outcome:
         kinds = tuple(
             KindOutcome(Evidence[str(one["evidence"]).upper()], float(one["asked_mm2"]), float(one["reached_mm2"]))
             for one in kept.get("kinds", ())
+            if "reached_mm2" in one  # in older records stands something else, from which nothing is to be learned
         )
         missed, empty = (
             np.array(kept.get(name, ()), dtype=np.float64).reshape(-1, 3) for name in ("missed_mm", "empty_mm")

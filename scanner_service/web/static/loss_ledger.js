@@ -99,7 +99,7 @@ export function headline(losses) {
   const passes = losses.passes ?? [];
   const partial = sum(passes.map((account) => account.lines.partial));
   const lostOf = ({ lines: account }) => sum(Object.fromEntries(Object.entries(account.lost ?? {}).filter(([reason]) => !UNWANTED.has(reason))));
-  // the accounts of the passes hold all of them, from the wire to the record, the device's only the latest pass
+  // the accounts of the passes hold all of them, from the wire to the record; the device's end at the wire
   const lostLines = passes.length ? sum(passes.map(lostOf)) : sum(lines?.refused) + (lines?.conflicts ?? 0) + sum(device?.lines?.lost);
   const { dropout: _, ...lostInMap } = points?.dropped ?? {};
   const lostPoints = sum(lostInMap) + (device?.lines ? 0 : sum(device?.dropped));

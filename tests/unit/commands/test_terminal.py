@@ -70,3 +70,9 @@ def test_progress_says_what_the_coverage_is_of_and_counts_partial_lines(kind, pr
     text = " ".join(told.get().split())
     assert said in text
     assert "3 lines lost, 79 partial" in text
+
+
+def test_only_the_program_itself_offers_to_install_a_completion():
+    of_all, of_one = (CliRunner().invoke(app, [*command, "--help"]).output for command in ([], ["verify"]))
+    assert "--install-completion" in of_all
+    assert "--json" in of_one and "completion" not in of_one

@@ -185,6 +185,18 @@ def test_lines_that_come_farther_apart_or_closer_than_ordered_are_taken_and_told
     assert any(isinstance(event, Advice) and "come 0.5 mm apart" in event.text for event in told) is is_told
 
 
+@pytest.mark.parametrize("at_look", range(1, 8))
+def test_a_pause_among_the_first_lines_on_a_conveyor_is_no_spacing(at_look):
+    scanner, drive = on_a_conveyor(0.5)  # asked line by line, as some scanners are: it measures nothing meanwhile
+
+    def hold_up():
+        scanner.shop.now_s += 0.6
+
+    scanner.shop.at_look[at_look] = hold_up
+    MotionPass(drive, scanner).run()
+    assert not [event for event in drive.told.take(0.0) if isinstance(event, Advice)]
+
+
 @pytest.mark.parametrize(
     ("speed", "rate_hz", "text"), [(math.nan, 38.0, "the pass goes at 19 mm/s"), (20.0, 40.0, "go at 19 mm/s or less")]
 )

@@ -14,6 +14,7 @@ from scanner_service.rescan.passes.outcome import Outcome
 from scanner_service.rescan.passes.planner import plan_passes
 from scanner_service.rescan.passes.serving import Serving
 from scanner_service.rescan.passes.tried import TRIES
+from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions import pass_planning
@@ -21,6 +22,7 @@ from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.closed_loop import LoopLimits
 from scanner_service.sessions.errors import PassUnknown, SessionBusy
 from scanner_service.sessions.pass_orders import PassStatus
+from scanner_service.sessions.references import Nominal
 from scanner_service.sessions.rig_setups import RigSetup
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
@@ -28,6 +30,7 @@ from scanner_service.storage.record import Record
 from simulators.parts import step
 from simulators.posed_rig import PosedScanner
 from tests.unit.rescan.passes.posed_scans import DENSITY, FROM_ABOVE, OPTICS, SCANNER, free_reach, linear_reach
+from tests.unit.rescan.passes.test_serving import box_corners
 
 
 @pytest.fixture
@@ -142,6 +145,22 @@ def test_a_plan_that_is_overtaken_by_another_rig_is_made_again(book, scanned, mo
     plan = desk.plan()
     assert [reach.limits.axis for reach in reaches] == [AxisKind.FREE_POSE, AxisKind.LINEAR]
     assert all(np.allclose(one.direction, FROM_ABOVE.travel) for one in plan.passes)
+
+
+def test_a_plan_is_made_again_for_another_nominal_part(book, scanned):
+    session, _ = scanned
+    desk = book.pass_desk(session)
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
+    points_mm = session.results().snapshot.points_mm
+    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
+    needed_mm2 = []
+    for way_mm in (0.0, 20.0):  # the second part goes on where nobody scanned
+        part = ReferenceSurface.of(box_corners(low - np.array([0.0, way_mm, 5.0]), high))
+        session.measure_against(None, Nominal(part))
+        plan = desk.plan()
+        assert desk.plan() is plan
+        needed_mm2.append(plan.needed_mm2)
+    assert needed_mm2[1] > needed_mm2[0] + 100.0
 
 
 def test_a_session_between_two_passes_is_not_closed_to_make_room(book, scanned, monkeypatch):

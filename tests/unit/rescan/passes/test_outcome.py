@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scanner_service.rescan.passes.needs import FIRM_KINDS, FIRST_CHANCES, HIDDEN_KINDS, Evidence
-from scanner_service.rescan.passes.outcome import owners_of, reckon
+from scanner_service.rescan.passes.outcome import Outcome, owners_of, reckon
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.passes.recommendation import Promise, RecommendedPass
 from scanner_service.rescan.passes.tried import LOWERED
@@ -64,3 +64,10 @@ def test_what_was_promised_what_was_explored_and_what_was_found_besides_is_all_t
     assert (nothing.reached_mm2, nothing.found_mm2, nothing.besides_mm2) == (0.0, 0.0, 0.0)
     assert len(nothing.missed_mm) == len(one.places_mm)
     assert len(nothing.empty_mm) == np.isin(one.place_evidence, HIDDEN_KINDS).sum()
+
+
+def test_an_outcome_of_a_record_that_told_kinds_otherwise_is_read_and_teaches_nothing_of_them():
+    now = Outcome((), np.zeros((1, 3))).to_dict()
+    kept = now | {"kinds": [{"evidence": "frontier", "asked_mm2": 4.0, "kept_mm2": 3.0}], "missed_mm": [[1, 2, 3]]}
+    outcome = Outcome.from_dict(kept)
+    assert outcome.kinds == () and outcome.missed_mm.tolist() == [[1.0, 2.0, 3.0]]
