@@ -6,6 +6,7 @@ from scanner_service.sessions.memory_bound import (
     LEAST_POINTS,
     MOST_POINTS,
     available_bytes,
+    left_to_group_bytes,
     points_at_once,
 )
 
@@ -26,3 +27,21 @@ def test_free_memory_is_what_the_system_says_or_unknown(tmp_path):
         said.write_text(nonsense)
         assert available_bytes(said) is None
     assert available_bytes(tmp_path / "absent") is None
+
+
+def test_a_container_is_told_what_its_own_limit_leaves(tmp_path):
+    own, groups = tmp_path / "cgroup", tmp_path / "groups"
+    inner = groups / "system.slice" / "scanner.service"
+    inner.mkdir(parents=True)
+    own.write_text("4:memory:/elsewhere\n0::/system.slice/scanner.service\n")
+    assert left_to_group_bytes(own, groups) is None, "no group has a limit"
+    for folder, most, used, idle in ((inner, "max", 900, 100), (inner.parent, "2000", 1500, 300)):
+        (folder / "memory.max").write_text(f"{most}\n")
+        (folder / "memory.current").write_text(f"{used}\n")
+        (folder / "memory.stat").write_text(f"anon 5\ninactive_file {idle}\n")
+    assert left_to_group_bytes(own, groups) == 800
+    (inner / "memory.max").write_text("1000\n")
+    assert left_to_group_bytes(own, groups) == 200
+    (inner / "memory.max").write_text("much\n")
+    assert left_to_group_bytes(own, groups) == 800
+    assert left_to_group_bytes(tmp_path / "absent", groups) is None
