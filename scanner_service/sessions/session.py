@@ -219,6 +219,7 @@ class LiveSession:
         ------
         RequirementUnusable : it contradicts itself, or the scanner's noise; what was asked for before stays.
         RecordError : the record does not take it; what was asked for before stays.
+        TimeoutError : the record does not answer yet; what was asked for before stays until the session is reopened.
         """
         with self._asking:
             self._ask_for(replace(self.settings, target=requirement), self._nominal)
