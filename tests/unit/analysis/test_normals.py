@@ -23,7 +23,7 @@ FITTING = ("orthogonal_distance", "fixed_radius", "adaptive_radius", "gaussian")
 def test_normals_of_a_sphere_without_noise_are_right_and_do_not_depend_on_where_it_lies(method):
     points, truth = sphere(600, 10.0, np.random.default_rng(1))
     here = estimate_normals(points, method, EVERYTHING)
-    assert rms_deg(here.normals, truth) < 8.0
+    assert rms_deg(here.normals, truth) < 5.0
     np.testing.assert_allclose(np.linalg.norm(here.normals, axis=1), 1.0, atol=1e-12)
     there = estimate_normals(points + np.array([4096.0, -512.0, 64.0]), method, EVERYTHING)
     assert np.median(angle_deg(here.normals, there.normals)) < 1e-4
