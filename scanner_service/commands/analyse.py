@@ -21,6 +21,7 @@ from scanner_service.commands.orienting import orient_snapshot
 from scanner_service.commands.small_memory import give_memory_back
 from scanner_service.commands.terminal import check_folder, console, errors, plain_errors, show_json
 from scanner_service.sessions.results import summarise_cloud
+from scanner_service.storage.database import is_sqlite
 from scanner_service.storage.exports.points_ply import write_points_ply
 from scanner_service.storage.exports.results_json import write_json
 from scanner_service.storage.exports.whole_file import write_whole
@@ -48,7 +49,7 @@ def analyse_command(
     ceiling: Annotated[float | None, typer.Option(help="With --method: largest radius in mm.")] = None,
     ball_factor: Annotated[float | None, typer.Option(help="With --method: when a Delaunay ball is big.")] = None,
     max_error: Annotated[float, typer.Option(help="With --method: normals less certain (degrees) are left out.")] = 5.0,
-    session: Annotated[str | None, typer.Option(help="With --method: which session of a record file.")] = None,
+    session: Annotated[str | None, typer.Option(help="With --method: session of a record: id, first letters.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
 ) -> None:
     """Analyse a cloud with a given radius or one of the chapter's rules, and write the result files."""
@@ -77,6 +78,8 @@ def analyse_command(
         refuse(stated, "it belongs to --method")
         chosen = _rule(rule, radius)
         check_folder(out)
+        if is_sqlite(file):
+            raise ValueError(f"{file.name} is a record: say --method M for its points, or `scanner replay` for its map")
         cloud = open_cloud(file, ReadOptions(parse_units(units)))
         position = parse_position(seen_from)
         compile_apart(None, len(cloud.points_mm))

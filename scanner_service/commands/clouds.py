@@ -1,4 +1,4 @@
-"""Points for the commands that analyse clouds: from a file, or from a session of a record with its laser positions."""
+"""Points for the commands that analyse clouds: from a file, or from a session of a record, as stored or as mapped."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,14 +6,18 @@ from pathlib import Path
 import numpy as np
 
 from drivers.scanline import Float64Array
+from scanner_service.analysis.comparison.shapes import KnownCloud, known_cloud
 from scanner_service.analysis.intake import QUANTUM_MM
 from scanner_service.analysis.passes import pass_key
+from scanner_service.analysis.snapshot import Unreliable
 from scanner_service.commands.options import parse_units
-from scanner_service.sessions.source_specs import RecordSpec
+from scanner_service.sessions.stored import find_session, read_session
 from scanner_service.sessions.withdrawals import withdrawn_passes
 from scanner_service.storage.database import is_sqlite
 from scanner_service.storage.formats import FileEmpty, ReadOptions, open_cloud
 from scanner_service.storage.reader import RecordReader
+
+NEWEST = "latest"
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +34,14 @@ class OpenedCloud:
 
 
 def open_points(file: Path, units: str | None, session: str | None) -> OpenedCloud:
-    """The points of a cloud file, or of a session of a record (the newest unless named).
+    """The points of a cloud file, or of a session of a record (the newest unless its id or first letters are given).
 
     Raises
     ------
     FormatError, RecordError, SessionError, ValueError : with one plain sentence.
     """
     if is_sqlite(file):
-        if units is not None:
-            raise ValueError("a record is in millimetres: leave out --units")
+        refuse_units(units)
         return _of_record(file, session)
     if session is not None:
         raise ValueError(f"{file.name} is not a record of this service: leave out --session")
@@ -48,10 +51,52 @@ def open_points(file: Path, units: str | None, session: str | None) -> OpenedClo
     )
 
 
+def open_known(file: Path, units: str | None, session: str | None) -> tuple[KnownCloud, dict[str, int]]:
+    """A cloud with the normals that came with it, or a session with those of its live map; what is left out, and why.
+
+    The live map's normals are turned to the laser; they are an estimate too, which the cloud's `reference` says.
+
+    Raises
+    ------
+    FormatError, RecordError, SessionError, AnalysisError, ValueError : with one plain sentence.
+    """
+    if is_sqlite(file):
+        refuse_units(units)
+        return _as_mapped(file, session)
+    opened = open_points(file, units, session)
+    if opened.normals is None:
+        raise ValueError(
+            f"{file.name} has no normals to compare with: give a cloud with x y z nx ny nz, or leave the file out"
+        )
+    cloud, kept = known_cloud(file.name, opened.points_mm, opened.normals)
+    return cloud, {"no reference normal": int((~kept).sum())}
+
+
+def refuse_units(units: str | None) -> None:
+    """Refuse a length unit for a record; raises ValueError."""
+    if units is not None:
+        raise ValueError("a record is in millimetres: leave out --units")
+
+
+def _as_mapped(file: Path, session: str | None) -> tuple[KnownCloud, dict[str, int]]:
+    reader = RecordReader.open(file)
+    try:
+        row = find_session(reader, session or NEWEST)
+        stored = read_session(reader, row)
+    finally:
+        reader.close()
+    found, name = stored.results.snapshot, f"{file.name} {row.session_id}"
+    lost = {why.name.lower(): int((found.unreliable == why).sum()) for why in list(Unreliable)[1:]}
+    lost["damaged lines"] = len(stored.damaged)
+    if not (found.unreliable == Unreliable.RELIABLE).any():
+        raise ValueError(f"the live map of session {row.session_id} gives no reliable normal to compare with")
+    return known_cloud(name, found.points_mm, found.normals, "live map")[0], lost
+
+
 def _of_record(file: Path, session: str | None) -> OpenedCloud:
     reader = RecordReader.open(file)
     try:
-        row = RecordSpec.find(reader, session).session
+        row = find_session(reader, session or NEWEST)
         gone = withdrawn_passes(reader.events(row.session_id))
         points: list[Float64Array] = [np.empty((0, 3))]
         lasers: list[Float64Array] = [np.empty((0, 3))]

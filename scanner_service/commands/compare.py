@@ -1,4 +1,4 @@
-"""`scanner compare`: every method of normal estimation side by side, under noise, on clouds whose normals are known."""
+"""`scanner compare`: every method of normals side by side, under noise, against known normals or a live map's."""
 
 import csv
 import io
@@ -16,9 +16,9 @@ from scanner_service import __version__
 from scanner_service.analysis.comparison.noise import LEVELS, NoiseLevel
 from scanner_service.analysis.comparison.peers import peers
 from scanner_service.analysis.comparison.running import Meter, Row, compare, our_methods
-from scanner_service.analysis.comparison.shapes import CUSTOMARY, SHAPES, KnownCloud, known_cloud
+from scanner_service.analysis.comparison.shapes import CUSTOMARY, SHAPES, KnownCloud
 from scanner_service.analysis.normals.estimating import METHODS
-from scanner_service.commands.clouds import open_points
+from scanner_service.commands.clouds import open_known
 from scanner_service.commands.compiling_apart import compile_apart
 from scanner_service.commands.measuring import measured
 from scanner_service.commands.small_memory import give_memory_back
@@ -28,11 +28,14 @@ from scanner_service.storage.exports.results_json import write_json
 from scanner_service.storage.exports.whole_file import write_whole
 
 FILES = ("comparison.csv", "comparison.json", "comparison.png")
+LIVE_MAP = "live map"
+NO_TRUTH = "angles are differences from the live map's own reliable normals, not errors: a scan has no known normals"
 
 
 def compare_command(
     files: Annotated[
-        list[Path] | None, typer.Argument(help="Clouds with reference normals; sphere, cylinder and edge without any.")
+        list[Path] | None,
+        typer.Argument(help="Clouds with reference normals, or records; sphere, cylinder and edge without any."),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the table and the picture.")] = Path("out"),
     shape: Annotated[list[str] | None, typer.Option(help=f"{', '.join(SHAPES)}; repeat it for more.")] = None,
@@ -45,17 +48,24 @@ def compare_command(
         bool, typer.Option("--peers", help="Also plain PCA, and Open3D if installed, each at its best setting.")
     ] = False,
     units: Annotated[str | None, typer.Option(help="Length unit of the files: mm, m, inch or auto.")] = None,
+    session: Annotated[
+        str | None, typer.Option(help="Which session of a record: its id or first letters; the newest by default.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of shapes and noise.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print the rows as JSON.")] = False,
 ) -> None:
-    """Add noise to clouds whose normals are known, run every method, and print and save a table and a picture."""
+    """Add noise to clouds whose normals are known, run every method, and print and save a table and a picture.
+
+    A session of a record has no known normals: there the live map's own are the reference, and the figures are
+    differences from the live map, not errors.
+    """
     give_memory_back()
     with plain_errors():
+        check_folder(out)
         levels = _levels(noise)
         names = _known(method, tuple(METHODS), "method")
         rng = np.random.default_rng(seed)
-        clouds = _clouds(files or [], _known(shape, tuple(SHAPES), "shape"), points, units, rng)
-        check_folder(out)
+        clouds = _clouds(files or [], _known(shape, tuple(SHAPES), "shape"), points, units, session, rng)
         for name in METHODS if names is None else names:
             compile_apart(name, max(len(cloud.points_mm) for cloud in clouds))
         contestants = our_methods(names)
@@ -95,6 +105,7 @@ def row_answer(row: Row) -> dict[str, Any]:
     """A row as it is saved: angles in degrees, shares from 0 to 1."""
     return {
         "cloud": row.cloud,
+        "reference": row.reference,
         "points": row.points,
         "noise": row.noise.label,
         "method": row.method,
@@ -111,20 +122,24 @@ def row_answer(row: Row) -> dict[str, Any]:
 
 
 def _clouds(
-    files: Sequence[Path], shapes: list[str] | None, points: int, units: str | None, rng: np.random.Generator
+    files: Sequence[Path],
+    shapes: list[str] | None,
+    points: int,
+    units: str | None,
+    session: str | None,
+    rng: np.random.Generator,
 ) -> list[KnownCloud]:
     """The clouds asked for: files, shapes or both; the customary shapes when nothing is."""
+    if session is not None and not files:
+        raise ValueError("--session names a session of a record: give the record too")
     clouds = [SHAPES[name](points, rng) for name in (shapes or ([] if files else CUSTOMARY))]
     for file in files:
-        opened = open_points(file, units, None)
-        if opened.normals is None:
-            raise ValueError(
-                f"{file.name} has no normals to compare with: give a cloud with x y z nx ny nz, or leave the file out"
-            )
-        cloud, kept = known_cloud(file.name, opened.points_mm, opened.normals)
-        lost = int((~kept).sum())
-        if lost:
-            errors.print(f"note: {lost} points of {file.name} have no reference normal and are left out")
+        cloud, lost = open_known(file, units, session)
+        told = ", ".join(f"{count:,} {reason.replace('_', ' ')}" for reason, count in lost.items() if count)
+        if told:
+            errors.print(f"note: left out of {cloud.name}: {told}", highlight=False, soft_wrap=True)
+        if cloud.reference == LIVE_MAP:
+            errors.print(f"note: {cloud.name}: {NO_TRUTH}", highlight=False, soft_wrap=True)
         clouds.append(cloud)
     return clouds
 
@@ -179,7 +194,8 @@ def _csv(rows: Sequence[dict[str, Any]]) -> bytes:
 def _table(name: str, rows: Sequence[Row]) -> Table:
     """Rms errors in degrees: methods down, noise across."""
     levels = list(dict.fromkeys(row.noise.label for row in rows))
-    table = Table(title=f"{name}, {rows[0].points:,} points: rms error in degrees", title_justify="left")
+    what = "difference from the live map" if rows[0].reference == LIVE_MAP else "error"
+    table = Table(title=f"{name}, {rows[0].points:,} points: rms {what} in degrees", title_justify="left")
     table.add_column("method", no_wrap=True)
     for level in levels:
         table.add_column(level.replace(" ", "\n"), justify="right")

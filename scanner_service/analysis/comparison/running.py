@@ -9,7 +9,7 @@ import numpy as np
 from drivers.scanline import Float64Array
 from scanner_service.analysis.comparison.noise import LEVELS, NoiseLevel, add_noise
 from scanner_service.analysis.comparison.scoring import Score, score
-from scanner_service.analysis.comparison.shapes import KnownCloud, sphere
+from scanner_service.analysis.comparison.shapes import KnownCloud, Reference, sphere
 from scanner_service.analysis.errors import AnalysisError
 from scanner_service.analysis.normals.estimating import METHODS, estimate_normals
 from scanner_service.analysis.normals.field import NormalOptions
@@ -33,7 +33,8 @@ class Contestant:
 class Row:
     """One method on one cloud at one noise level; time and memory are those of the setting that counts.
 
-    `failure` is the sentence by which the method refused, and the score is then all NaN.
+    `failure` is the sentence by which the method refused, and the score is then all NaN. `reference` says what the
+    score is against: where that is the live map, angles are differences from it, not errors.
     """
 
     cloud: str
@@ -45,6 +46,7 @@ class Row:
     seconds: float
     memory_bytes: float
     failure: str | None = None
+    reference: Reference = "shape"
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +99,11 @@ def _best(cloud: KnownCloud, points: Float64Array, level: NoiseLevel, contestant
     for setting, estimator in contestant.settings.items():
         try:
             normals, seconds, memory = meter.measure(lambda estimator=estimator: estimator(points))  # type: ignore[misc]
-            row = Row(
-                cloud.name, len(points), level, contestant.name, setting, score(normals, cloud.normals), seconds, memory
-            )
+            found, failure = score(normals, cloud.normals), None
         except AnalysisError as error:
-            row = Row(cloud.name, len(points), level, contestant.name, setting, nothing, math.nan, math.nan, str(error))
+            found, seconds, memory, failure = nothing, math.nan, math.nan, str(error)
+        whose = (cloud.name, len(points), level, contestant.name, setting)
+        row = Row(*whose, found, seconds, memory, failure, cloud.reference)
         if best is None or not row.score.rms_rad >= best.score.rms_rad:
             best = row
     assert best is not None, "a contestant has at least one setting"

@@ -3,27 +3,34 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.errors import MethodRefused
 
+Reference = Literal["shape", "file", "live map"]
+"""Where normals that others are compared with are from; those of a live map are no truth but another estimate."""
+
 
 @dataclass(frozen=True, slots=True)
 class KnownCloud:
-    """Points (n, 3) in mm with unit normals (n, 3), whose sign has no meaning."""
+    """Points (n, 3) in mm with unit normals (n, 3), whose sign has no meaning, and where the normals are from."""
 
     name: str
     points_mm: Float64Array
     normals: Float64Array
+    reference: Reference = "shape"
 
     def __post_init__(self) -> None:
         read_only(self.points_mm)
         read_only(self.normals)
 
 
-def known_cloud(name: str, points_mm: Float64Array, normals: Float64Array) -> tuple[KnownCloud, BoolArray]:
+def known_cloud(
+    name: str, points_mm: Float64Array, normals: Float64Array, reference: Reference = "file"
+) -> tuple[KnownCloud, BoolArray]:
     """A cloud with reference normals (n, 3) of any length, and which of the points (n,) have one and are in it.
 
     Raises
@@ -35,7 +42,7 @@ def known_cloud(name: str, points_mm: Float64Array, normals: Float64Array) -> tu
     kept: BoolArray = np.asarray(np.isfinite(length) & (length > 0.0) & np.isfinite(points_mm).all(axis=1))
     if not kept.any():
         raise MethodRefused(f"{name} has no point with a reference normal, so there is nothing to compare with")
-    return KnownCloud(name, points_mm[kept], normals[kept] / length[kept, None]), kept
+    return KnownCloud(name, points_mm[kept], normals[kept] / length[kept, None], reference), kept
 
 
 def sphere(count: int, rng: np.random.Generator) -> KnownCloud:

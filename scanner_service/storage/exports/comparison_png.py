@@ -31,7 +31,9 @@ def comparison_png(rows: Sequence[Row], *, dpi: int = 110) -> bytes:
     _times(axes[panels - 1], rows, methods)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(methods)), frameon=False, fontsize=10)
-    figure.suptitle("Error of normals under noise, and what it costs", fontsize=14, fontweight="bold")
+    only_sessions = all(row.reference == "live map" for row in rows)
+    what = "Difference of normals from the live map's" if only_sessions else "Error of normals"
+    figure.suptitle(f"{what} under noise, and what it costs", fontsize=14, fontweight="bold")
     picture = BytesIO()
     figure.savefig(picture, format="png", metadata={"Title": "Comparison of normals", "Software": "scanner-service"})
     return picture.getvalue()
@@ -52,7 +54,8 @@ def _errors(panel: Axes, cloud: str, rows: Sequence[Row], methods: Sequence[str]
         )
     panel.set_title(f"{cloud}, {rows[0].points:,} points".replace(",", "\u202f"), fontsize=11)
     panel.set_xticks(range(len(levels)), levels, rotation=30, ha="right", fontsize=9)
-    panel.set_ylabel("rms error, degrees (log scale)")
+    what = "difference from the live map" if rows[0].reference == "live map" else "error"
+    panel.set_ylabel(f"rms {what}, degrees (log scale)")
     panel.set_yscale("log")
     panel.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     panel.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:g}"[0] in "235" else "")

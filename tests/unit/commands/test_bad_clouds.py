@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from scanner_service.analysis.method_analysis import METHOD_NAMES
+from scanner_service.analysis.errors import AnalysisError
+from scanner_service.analysis.method_analysis import METHOD_NAMES, analyse_by_method
 from scanner_service.cli import app
 
 ORIENTED = ("fixed_radius", "bivariate_quadric", "big_delaunay_balls")
@@ -29,11 +30,30 @@ def only_numbers(text):
 
 
 @pytest.mark.parametrize("name", BAD_CLOUDS)
-def test_every_method_answers_with_reasons_or_refuses_in_a_sentence(name, tmp_path):
+@pytest.mark.parametrize("method", METHOD_NAMES)
+def test_every_point_has_a_normal_or_a_reason_or_the_cloud_is_refused(method, name):
+    points = BAD_CLOUDS[name]
+    try:
+        found = analyse_by_method(points, method)
+    except AnalysisError as refusal:
+        assert len(str(refusal)) > 40
+        return
+    given = found.reason == 0
+    assert sum(found.counts.values()) == len(points)
+    assert np.isnan(found.normals[~given]).all()
+    np.testing.assert_allclose(np.linalg.norm(found.normals[given], axis=1), 1.0, atol=1e-9)
+
+
+FEW = [("big_delaunay_balls", []), ("general_quadric", []), ("bivariate_quadric", ["--orient"])]
+ALL = [*((method, []) for method in METHOD_NAMES), *((method, ["--orient"]) for method in ORIENTED)]
+
+
+@pytest.mark.parametrize("runs", [FEW, pytest.param(ALL, marks=pytest.mark.long)], ids=["few", "all"])
+@pytest.mark.parametrize("name", BAD_CLOUDS)
+def test_every_method_answers_with_reasons_or_refuses_in_a_sentence(name, runs, tmp_path):
     file, points = tmp_path / "cloud.xyz", BAD_CLOUDS[name]
     np.savetxt(file, points)
-    upwards = [(method, []) for method in METHOD_NAMES]
-    for number, (method, orient) in enumerate([*upwards, *((name, ["--orient"]) for name in ORIENTED)]):
+    for number, (method, orient) in enumerate(runs):
         out = tmp_path / f"{number}"
         arguments = ["analyse", file, "--method", method, "--units", "mm", "--out", out, *orient]
         found = CliRunner().invoke(app, [str(argument) for argument in arguments])

@@ -15,7 +15,9 @@ from scanner_service.analysis.comparison.scoring import score
 from scanner_service.analysis.comparison.shapes import SHAPES
 from scanner_service.analysis.errors import MethodRefused
 from scanner_service.cli import app
+from scanner_service.sessions.settings import SessionSettings
 from scanner_service.storage.formats import open_cloud
+from tests.unit.sessions.test_tiles import recorded
 
 RUNNER = CliRunner()
 
@@ -154,3 +156,20 @@ def test_analyse_refuses_options_without_effect(ball, tmp_path, arguments, said)
     answer = run("analyse", ball, *arguments, "--out", tmp_path / "out")
     assert answer.exit_code == 1, answer.output
     assert said in one_line(answer)
+
+
+def test_a_session_is_compared_with_its_live_map_and_the_figures_are_called_differences(tmp_path):
+    record = tmp_path / "record.sqlite"
+    recorded(record, SessionSettings(max_points=20_000), withdraw=True)
+    out = tmp_path / "out"
+    chosen = ["--session", "latest", "--method", "gaussian", "--noise", "0box", "--out", out]
+    answer = run("compare", record, *chosen)
+    assert answer.exit_code == 0, answer.output
+    assert "differences from the live map" in one_line(answer)
+    assert "rms error" not in one_line(answer)
+    assert "2,250 not counted" in one_line(answer)  # the pass that was withdrawn
+    (row,) = json.loads((out / "comparison.json").read_text())["rows"]
+    assert (row["reference"], row["points"]) == ("live map", 30 * 70 + 12 * 40)
+    assert row["median_deg"] < 5.0
+    assert run("compare", record, "--session", "nobody", "--out", out).exit_code == 1
+    assert run("compare", "--session", "latest", "--out", out).exit_code == 1

@@ -71,15 +71,15 @@ def test_the_spanning_tree_is_the_one_that_kruskal_finds(points):
     assert edges(euclidean_spanning_tree(points)) == truth
 
 
-@settings(max_examples=60, deadline=None)
-@given(any_cloud(most=25))
+@settings(max_examples=30, deadline=None)
+@given(any_cloud(most=18))
 def test_relative_neighbours_have_an_empty_lune(points):
     truth = empty_pairs(points, lambda square, i, j, k: max(square[i, k], square[j, k]) < square[i, j])
     assert edges(relative_neighbourhood_graph(points)) == truth
 
 
-@settings(max_examples=60, deadline=None)
-@given(any_cloud(most=25))
+@settings(max_examples=30, deadline=None)
+@given(any_cloud(most=18))
 def test_gabriel_neighbours_have_an_empty_ball(points):
     truth = empty_pairs(points, lambda square, i, j, k: square[i, k] + square[k, j] < square[i, j])
     assert edges(gabriel_graph(points)) == truth
