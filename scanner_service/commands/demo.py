@@ -120,7 +120,7 @@ def tell(regions: list[dict[str, Any]], summary: dict[str, Any], out: Path) -> N
         f"{summary['points']:,} points in {summary['scanlines']:,} scanlines, "
         f"{summary['reliable_share']:.1%} with a reliable normal; "
         f"observed coverage {'unknown' if coverage is None else format(coverage, '.1%')} "
-        f"({summary['coverage']['gap_mm2']:,.0f} mm² of walls and shadows were never seen)",
+        f"({summary['coverage']['gap_mm2']:,.0f} mm² of gaps)",
         highlight=False,
     )
     console.print(loss_sentence(summary["losses"]), highlight=False, soft_wrap=True)
@@ -130,11 +130,22 @@ def tell(regions: list[dict[str, Any]], summary: dict[str, Any], out: Path) -> N
 def wait_until_ready(url: str) -> None:
     """Wait for the kernels; they are compiled once, at the first start on a machine."""
     begun_s = time.monotonic()
-    with errors.status("compiling kernels (only the first time) …"):
-        while httpx.get(f"{url}/readyz").status_code != httpx.codes.OK:
+    said = "compiling kernels (only the first time) …"
+    if not errors.is_terminal:
+        errors.print(said)
+    with errors.status(said):
+        while not _is_ready(url):
             if time.monotonic() - begun_s > _COMPILING_S:
-                fail("the service did not become ready in ten minutes; run `scanner serve` and look at /readyz")
+                fail("the service did not become ready in ten minutes: run it again, what was compiled is kept")
             time.sleep(_POLL_S)
+
+
+def _is_ready(url: str) -> bool:
+    """Whether the service can scan; one that is too busy compiling to answer cannot yet."""
+    try:
+        return httpx.get(f"{url}/readyz").status_code == httpx.codes.OK
+    except httpx.TimeoutException:
+        return False
 
 
 @contextlib.contextmanager

@@ -80,6 +80,10 @@ def _one(client: httpx.Client, where: str, number: int, turned: bool, serving: S
     """Accept a pass, carry it out and wait for its end; a hand is guided meanwhile. One refused is cancelled."""
     order = _ask(client.post(f"{where}/recommended-passes/{number}/accept", params=serving))
     mine = f"{where}/pass-orders/{order['order']}"
+    errors.print(f"order {order['order']}: {_said(order)}", highlight=False, soft_wrap=True)
+    if turned and order["pass"]["turn_part"] is None:
+        client.delete(mine)
+        fail(f"pass {number} of the plan as it is now asks for no turn of the part: list the plan again")
     _ask(client.post(f"{mine}/carry-out", json={"part_is_turned": turned}))
     by_hand = _ask(client.get(where))["source"]["kind"] == "push"
     said = ""

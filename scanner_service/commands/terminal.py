@@ -61,6 +61,8 @@ def plain_errors() -> Iterator[None]:
     before = _MADE.set(())
     try:
         yield
+    except httpx.TimeoutException:
+        fail("the service did not answer in time: the computer is too busy; what it was asked for may be done yet")
     except EXPECTED as error:
         fail(str(error) or type(error).__name__)
     except KeyboardInterrupt:
@@ -246,7 +248,7 @@ def _missed(region: Mapping[str, Any]) -> tuple[str, str]:
     """What a region has and what it needs, by the limit that it misses; by its density where no other is known."""
     limit = region.get("limit")
     if limit is None:
-        return f"{_number(region['measured_per_mm2'])} /mm²", f"{_number(region['required_per_mm2'])} /mm²"
+        return f"{_number(region['measured_per_mm2'])} /mm²", f"≥ {_number(region['required_per_mm2'])} /mm²"
     return str(limit["has"]), str(limit["needs"])
 
 

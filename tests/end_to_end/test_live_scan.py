@@ -294,7 +294,9 @@ def test_pushed_scanlines_are_answered_when_durable_and_stored_once(service):
     first = service.client.post(url, json={"lines": lines})
     assert {line["outcome"] for line in first.json()["lines"]} == {"stored"}
     again = service.client.post(url, json={"lines": lines[:3]})
-    assert {line["outcome"] for line in again.json()["lines"]} == {"duplicate"}
+    assert (again.status_code, {line["outcome"] for line in again.json()["lines"]}) == (200, {"duplicate"})
+    other = service.client.post(url, json={"lines": [lines[0] | {"points_mm": lines[1]["points_mm"]}]})
+    assert (other.status_code, other.json()["lines"][0]["outcome"]) == (409, "conflict")
     status = service.client.post(f"/api/v1/sessions/{session_id}/stop").json()
     assert (status["state"], status["lines"], status["points"]) == ("stopped", 20, 20 * 34)
     with live_client(service, session_id) as client:  # more may be pushed later: the stream stays open

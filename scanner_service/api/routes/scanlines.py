@@ -21,7 +21,8 @@ router = APIRouter(prefix="/api/v1/sessions/{session_id}/scanlines", tags=["scan
 async def push_scanlines(session: Session, body: ScanlinesIn) -> Response:
     """Hand over scanlines. The answer comes when every line's commit has returned, with one outcome a line.
 
-    Pushing the same lines again is safe: they are answered as `duplicate`.
+    Pushing the same lines again is safe: they are answered as `duplicate`. The status is 409 when a line of them is not
+    stored: refused, or in conflict with another line of its index.
     """
 
     def push() -> "list[Future[Stored]]":
@@ -35,7 +36,8 @@ async def push_scanlines(session: Session, body: ScanlinesIn) -> Response:
         else {"line_index": line.line_index, "outcome": "refused", "detail": str(outcome)}
         for line, outcome in zip(body.lines, outcomes, strict=True)
     ]
-    return answer({"lines": results}, 200 if all(isinstance(outcome, Stored) for outcome in outcomes) else 409)
+    is_stored = all(isinstance(outcome, Stored) and outcome.outcome != "conflict" for outcome in outcomes)
+    return answer({"lines": results}, 200 if is_stored else 409)
 
 
 @router.get("", dependencies=[viewer])
