@@ -18,7 +18,7 @@ from scanner_service.sessions.export_desk import ExportDesk
 from scanner_service.sessions.file_shelf import FileShelf
 from scanner_service.sessions.readiness import kernels_are_ready, warm_up
 from scanner_service.sessions.retention import Retention
-from scanner_service.storage.errors import RecordError
+from scanner_service.storage.errors import RecordError, RecordUnusable
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import Limits
@@ -59,9 +59,12 @@ class Service:
 
         Raises RecordUnusable or KeyStoreError, with nothing left open.
         """
-        data_dir.mkdir(parents=True, exist_ok=True, mode=0o700)
         replay_dir = data_dir / "replay"
-        replay_dir.mkdir(exist_ok=True)
+        try:
+            data_dir.mkdir(parents=True, exist_ok=True, mode=0o700)
+            replay_dir.mkdir(exist_ok=True)
+        except OSError as error:
+            raise RecordUnusable(f"{data_dir} cannot be the folder of the data: {error.strerror}") from error
         record = Record.open(record_at or data_dir / "record.sqlite", limits=limits)
         try:
             book = SessionBook(record, retention, meshes=replay_dir, rigs=data_dir / "rigs")

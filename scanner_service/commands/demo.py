@@ -122,6 +122,7 @@ def tell(regions: list[dict[str, Any]], summary: dict[str, Any], out: Path) -> N
         f"observed coverage {'unknown' if coverage is None else format(coverage, '.1%')} "
         f"({summary['coverage']['gap_mm2']:,.0f} mm² of gaps)",
         highlight=False,
+        soft_wrap=True,
     )
     console.print(loss_sentence(summary["losses"]), highlight=False, soft_wrap=True)
     console.print(f"Written to {out}: {', '.join(OUTPUT_FILES)}", highlight=False, soft_wrap=True)

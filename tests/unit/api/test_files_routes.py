@@ -11,6 +11,7 @@ from scanner_service.api.keys import Role
 from scanner_service.api.server import ServerThread
 from scanner_service.api.service import Service
 from scanner_service.sessions.settings import SessionSettings
+from scanner_service.storage.errors import RecordUnusable
 from scanner_service.storage.record import Record
 
 
@@ -47,3 +48,10 @@ def test_a_record_with_settings_that_nobody_knows_is_refused_and_let_go_of(opera
     assert "settings of the recorded session" in refused.json()["detail"]
     held = [os.path.realpath(one) for one in Path("/proc/self/fd").iterdir()]
     assert not [one for one in held if one.endswith("odd.sqlite")]
+
+
+def test_a_file_where_the_folder_of_the_data_should_be_is_named(tmp_path):
+    taken = tmp_path / "taken"
+    taken.write_text("")
+    with pytest.raises(RecordUnusable, match="taken cannot be the folder of the data: File exists"):
+        Service.open(taken)
