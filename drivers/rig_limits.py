@@ -82,11 +82,6 @@ class RigLimits:
         return (laser_z_mm - high, laser_z_mm - low)
 
     @property
-    def travel_rad(self) -> Interval:
-        """The travel of a turntable as angles; (NaN, NaN) for other axes."""
-        return (self.travel_mm[0] / self.radius_mm, self.travel_mm[1] / self.radius_mm)
-
-    @property
     def line_spacing_mm(self) -> Interval:
         """Finest and coarsest line spacing in continuous motion: speed over line rate, 0 where nothing bounds it."""
         finest = self.speed_mm_per_s[0] / self.line_rate_hz[1] if self.line_rate_hz[1] > 0 else math.nan

@@ -296,11 +296,10 @@ class Conversation(Talk):
     # ---- inside ---------------------------------------------------------------------------------------------------
 
     def _new_task(self) -> Task:
-        self._task = Task()
+        task = self._task = Task()
         if self.phase is not Phase.UP:
             self._fail_task(ScannerNotConnected("the scanner is not connected; wait until it is back"))
-            return Task(True, ScannerNotConnected("the scanner is not connected; wait until it is back"))
-        return self._task
+        return task
 
     def _finish_task(self) -> None:
         task, self._task = self._task, None

@@ -98,7 +98,7 @@ class GrblHost(StageHost):
             case "reset" | "identify" if waited_s > _BANNER_S:
                 self._greet(now_s)
 
-    def _greeted_by(self, report: Report, now_s: float) -> None:
+    def _greeted_by(self, report: Report) -> None:
         """A report in the greeting: end what an earlier program left running, then ask who is there."""
         match report.state:
             case State.JOG:
@@ -193,7 +193,7 @@ class GrblHost(StageHost):
         self._state = report.state
         self._offset = report.offset or self._offset
         if self.phase is Phase.GREETING:
-            self._greeted_by(report, now_s)
+            self._greeted_by(report)
             return
         at = self._machine_position(report)
         if at is not None and asked_s is not None:

@@ -80,8 +80,7 @@ def test_a_turntable_is_told_in_degrees_and_kept_as_arc() -> None:
     described = parse_rig(TURNTABLE, "turn.toml")
     assert described.name == "turn"
     limits = described.limits
-    assert limits.travel_rad == pytest.approx((-math.pi, math.pi))
-    assert limits.travel_mm[1] == pytest.approx(50 * math.pi)
+    assert limits.travel_mm == pytest.approx((-50 * math.pi, 50 * math.pi))
     assert limits.speed_mm_per_s[1] == pytest.approx(25 * math.pi)
     assert described.mm_per_unit * 360 == pytest.approx(2 * math.pi * 50)
     quarter = described.rig().part_from_sensor(50 * math.pi / 2).rotation
