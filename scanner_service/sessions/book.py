@@ -3,7 +3,7 @@
 import contextlib
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -100,33 +100,27 @@ class SessionBook:
         RecordError : the session could not be recorded.
         """
         try:
-            return self._create_once(name, spec, settings, origin_mm, source, key, reference)
+            if key is None:
+                return self._create(name, spec, settings, origin_mm, source, None, reference)
+            with self._making(key):
+                made = self.made_with(key)
+                if made is None:
+                    return self._create(name, spec, settings, origin_mm, source, key, reference)
+                let_go(spec)
+                return made
         except BaseException:
             let_go(spec)
             raise
 
-    def _create_once(
-        self,
-        name: str,
-        spec: SourceSpec,
-        settings: SessionSettings | None,
-        origin_mm: Sequence[float],
-        source: Source | None,
-        key: CreationKey | None,
-        reference: ReferenceSurface | None,
-    ) -> LiveSession:
-        if key is None:
-            return self._create(name, spec, settings, origin_mm, source, None, reference)
+    @contextlib.contextmanager
+    def _making(self, key: CreationKey) -> Iterator[None]:
+        """Hold off other requests with this key."""
         with self._lock:
             if key.key_sha256 in self._creating:
                 raise SessionBusy("the same request is being carried out; ask again in a moment")
             self._creating.add(key.key_sha256)
         try:
-            made = self.made_with(key)
-            if made is not None:
-                let_go(spec)
-                return made
-            return self._create(name, spec, settings, origin_mm, source, key, reference)
+            yield
         finally:
             with self._lock:
                 self._creating.discard(key.key_sha256)

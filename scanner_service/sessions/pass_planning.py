@@ -12,7 +12,7 @@ from scanner_service.rescan.passes.motion import Motion, StraightMotion
 from scanner_service.rescan.passes.outcome import Outcome
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.passes.recommendation import Plan
-from scanner_service.rescan.passes.serving import Serving, number_of
+from scanner_service.rescan.passes.serving import Serving
 from scanner_service.rescan.passes.tried import Tried
 from scanner_service.sessions.errors import PassUnknown
 from scanner_service.sessions.pass_orders import PassOrder
@@ -44,7 +44,7 @@ class PlanQuestion:
         PlanningError : the rig or the optics are not known.
         """
         results, setup = self.results, self.setup
-        open_ids = {number_of(region) for region in results.regions}
+        open_ids = {region.number for region in results.regions}
         unknown = sorted(self.serving.regions - open_ids)
         if unknown:
             raise PassUnknown(f"no region {unknown[0]} is open in this session; list the regions again")

@@ -17,7 +17,6 @@ from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.known_surface import IntArray, KnownSurface
 from scanner_service.rescan.passes.marching import FREE
 from scanner_service.rescan.passes.nominal import Missing
-from scanner_service.rescan.passes.serving import number_of
 from scanner_service.rescan.region import RescanRegion
 from scanner_service.rescan.regions import RegionReport
 from scanner_service.rescan.requirement import Requirement
@@ -125,7 +124,7 @@ def failing_points(
     """
     region = np.zeros(len(report.reason), dtype=np.int32)
     for listed in report.regions if regions is None else regions:
-        region[listed.point_rows[listed.point_rows < len(region)]] = number_of(listed)
+        region[listed.point_rows[listed.point_rows < len(region)]] = listed.number
     return report.judgement.fails, region
 
 
@@ -295,7 +294,7 @@ def _bare(regions: Sequence[RescanRegion], served: set[int]) -> Columns:
     bare = [
         region
         for region in regions
-        if number_of(region) not in served
+        if region.number not in served
         and region.reason is not Reason.ISOLATED
         and region.area_mm2 > 0
         and np.isfinite(region.normal).all()
@@ -305,7 +304,7 @@ def _bare(regions: Sequence[RescanRegion], served: set[int]) -> Columns:
         np.array([region.centroid_mm for region in bare]).reshape(-1, 3),
         np.array([region.normal for region in bare]).reshape(-1, 3),
         np.array([region.area_mm2 for region in bare], dtype=np.float64),
-        np.array([number_of(region) for region in bare], dtype=np.int64),
+        np.array([region.number for region in bare], dtype=np.int64),
         np.full(len(bare), Evidence.FLOOR, dtype=np.int64),
         np.full(len(bare), _BARE),
     )

@@ -8,7 +8,6 @@ import numpy as np
 from drivers.scanline import Float64Array, read_only
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.known_surface import IntArray
-from scanner_service.rescan.passes.serving import number_of
 from scanner_service.rescan.reference import ReferenceCoverage
 from scanner_service.rescan.region import RescanRegion
 
@@ -31,9 +30,7 @@ class Missing:
 
 def missing_of(coverage: ReferenceCoverage, regions: Sequence[RescanRegion]) -> Missing:
     """The untouched pieces of a nominal part; `regions` as they are followed, in whatever order."""
-    numbers = {
-        region.centroid_mm.tobytes(): number_of(region) for region in regions if region.reason is Reason.UNTOUCHED
-    }
+    numbers = {region.centroid_mm.tobytes(): region.number for region in regions if region.reason is Reason.UNTOUCHED}
     region = np.zeros(len(coverage.pieces.area_mm2), dtype=np.int64)
     for found, rows in zip(coverage.untouched, coverage.untouched_rows, strict=True):
         region[rows] = numbers.get(found.centroid_mm.tobytes(), 0)

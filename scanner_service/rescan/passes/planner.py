@@ -23,7 +23,7 @@ from scanner_service.rescan.passes.nominal import missing_of
 from scanner_service.rescan.passes.optics import ScannerOptics
 from scanner_service.rescan.passes.reach import Reach
 from scanner_service.rescan.passes.recommendation import Plan, Promise, RecommendedPass
-from scanner_service.rescan.passes.serving import EVERYTHING, Serving, number_of
+from scanner_service.rescan.passes.serving import EVERYTHING, Serving
 from scanner_service.rescan.passes.tried import Tried
 from scanner_service.rescan.passes.unreachable import in_vain, lost_regions, unreachable
 from scanner_service.rescan.passes.visibility import look_around
@@ -89,7 +89,7 @@ def plan_passes(
     explore = wishes.explore and wishes.serving.is_everything
     needs = find_needs(snapshot, report, surface, wanted, wishes.chances, explore, regions, missing)
     if not wishes.serving.is_everything:
-        named = [number_of(one) for one in regions if wishes.serving.wants(one)]
+        named = [one.number for one in regions if wishes.serving.wants(one)]
         needs = needs.only(np.isin(needs.region, named))
     needs, given_up = (tried or Tried.nothing()).of(needs, surface.cell_mm)
     needs = _thinned(needs)

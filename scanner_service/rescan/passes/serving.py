@@ -26,12 +26,7 @@ class Serving:
             return False
         if self.is_everything:
             return True
-        return number_of(region) in self.regions or region.reason in self.reasons
+        return region.number in self.regions or region.reason in self.reasons
 
 
 EVERYTHING = Serving()
-
-
-def number_of(region: RescanRegion) -> int:
-    """How a plan calls a region: by its id where it is followed through a session, else by its place in the report."""
-    return region.region_id or region.number
