@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.machine import describe_machine
 from scanner_service.analysis.intake import StoredLine
-from scanner_service.sessions import session as session_module
+from scanner_service.sessions import analyst as analyst_module
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.settings import SessionSettings
@@ -215,7 +215,7 @@ def _rates(lines: Sequence[object], took_s: float, waited_s: list[float]) -> dic
 def measure_reopening(folder: Path, count: int) -> dict[str, Any]:
     """A session of `count` lines opened from the record: map built, losses told, ready for questions; not judged."""
     warm_up()
-    session_module.ANALYSIS_PERIOD_S = 1e6  # the verdict is measured elsewhere
+    analyst_module.ANALYSIS_PERIOD_S = 1e6  # the verdict is measured elsewhere
     path = folder / "record"
     settings = SessionSettings(max_points=count * POINTS_A_LINE).to_dict()
     with Record.open(path) as record:

@@ -4,7 +4,7 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
@@ -231,6 +231,7 @@ class SessionBook:
         session.open(taken)
         with self._lock:
             self._live[row.session_id] = session
+        session.terms.read_again()  # it may have been renamed since its row was read
         return session
 
     def open_quietly(self, session_id: str) -> None:
@@ -274,7 +275,7 @@ class SessionBook:
         row = self.record.describe(session_id, name=name, notes=notes)
         live = self._live.get(session_id)
         if live is not None:
-            live.row = replace(live.row, name=row.name, notes=row.notes)
+            live.terms.read_again()
         return row
 
     def delete(self, session_id: str) -> None:

@@ -1,6 +1,7 @@
 """What a session writes of itself into its record: state, events, the account of its losses; never a scanline.
 
-A record that cannot be written for a while must not stop the scan: what it misses is written once it can be.
+A record that cannot be written for a while must not stop the scan: what it misses is written once it can be. Only
+`settle` and `close` ever wait for a disk.
 """
 
 import logging
@@ -11,9 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from scanner_service.sessions.ledger import Ledger
-from scanner_service.storage.errors import NotStorable, RecordError
+from scanner_service.storage.answer import Answer
+from scanner_service.storage.errors import NotStorable, RecordBusy, RecordError
 from scanner_service.storage.record import Record
-from scanner_service.storage.rows import WriterState
+from scanner_service.storage.rows import SessionRow, WriterState
 
 _LOG = logging.getLogger(__name__)
 _STATE_PATIENCE_S = 2.0
@@ -33,15 +35,17 @@ class Chronicle:
         self._session_id = session_id
         self._owed: deque[tuple[str, dict[str, Any]]] = deque()  # events that the disk did not take yet
         self._lost: Counter[str] = Counter()  # events that stood before the first that is owed
+        self._state_due: str | None = None  # the state that the disk did not take yet
+        self._state_written: Answer[SessionRow] | None = None
         self._pen = threading.Lock()  # whoever holds it writes: events stand in the order in which they came
         self._kept: Mapping[str, Any] | None = None  # the account of losses that was written last
         self._disk = _DiskWatch()
 
-    def event(self, kind: str, details: dict[str, Any], patience_s: float = 1.0) -> None:
-        """Write an event down behind those that are owed, now or when the record can be written again."""
+    def event(self, kind: str, details: dict[str, Any]) -> None:
+        """Write an event down behind those that are owed, now or when the record can be written again; never waits."""
         with self._pen:
             self._owed.append((kind, details))
-            if self._write_owed(patience_s):
+            if self._write_owed(0.0):
                 return
             _LOG.warning("the event %s of session %s will be recorded later", kind, self._session_id)
             if len(self._owed) > _MOST_OWED:
@@ -50,11 +54,21 @@ class Chronicle:
                 _LOG.warning("the event %s of session %s is lost: too many wait for the disk", gone, self._session_id)
 
     def state(self, state: str) -> None:
-        """Write the state down; waits a little until it is durable."""
+        """Write the state down, now or when the record can be written again; never waits."""
+        with self._pen:
+            self._state_due = state
+            self._write_state()
+
+    def settle(self) -> None:
+        """Wait a little until the state that was written last is durable."""
+        with self._pen:
+            written = self._state_written
+        if written is None:
+            return
         try:
-            self._record.change_state(self._session_id, state).result(_STATE_PATIENCE_S)
+            written.result(_STATE_PATIENCE_S)
         except TimeoutError:  # the disk is failing, the scan goes on meanwhile
-            _LOG.warning("the state %s of session %s will be recorded later", state, self._session_id)
+            _LOG.warning("the state of session %s will be recorded later", self._session_id)
         except RecordError as error:
             _LOG.warning("the state of session %s could not be recorded: %s", self._session_id, error)
 
@@ -78,6 +92,7 @@ class Chronicle:
         if self._record.writer_state().state == "ok":
             with self._pen:
                 self._write_owed(0.0)
+                self._write_state()
         told = self._disk.look(self._record.writer_state(), ledger, now_s)
         if told is not None:
             self.event(RECORD_RESUMED, told)
@@ -98,6 +113,19 @@ class Chronicle:
             if not self._write_owed(_LAST_PATIENCE_S):
                 number = len(self._owed) + self._lost.total()
                 _LOG.error("%d events of session %s are lost: the record took none", number, self._session_id)
+            self._write_state()
+
+    def _write_state(self) -> None:
+        if self._state_due is None:
+            return
+        try:
+            self._state_written = self._record.change_state(self._session_id, self._state_due)
+        except RecordBusy:
+            _LOG.warning("the state %s of session %s will be recorded later", self._state_due, self._session_id)
+            return
+        except RecordError as error:  # now and for ever
+            _LOG.warning("the state of session %s could not be recorded: %s", self._session_id, error)
+        self._state_due = None
 
     def _write_owed(self, patience_s: float) -> bool:
         """Write what is owed, in order, until the record takes no more; True when all is written."""

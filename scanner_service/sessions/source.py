@@ -6,6 +6,8 @@ A source runs its own thread and hands frozen scanlines to a `Sink`; it knows no
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
 from drivers.scanline import DeviceInfo, Float64Array, Scanline, SensorGeometry
 from drivers.tally import PassTally
 from scanner_service.analysis.intake import StoredLine
@@ -79,3 +81,13 @@ class OnPorts(Protocol):
 
     ports: tuple[str, ...]
     """As the user names them."""
+
+
+def look_as_before(known: Source, source: Source) -> None:
+    """Tell a source that follows another whether both look from the same side.
+
+    When they do not, each pass is judged by its own rays.
+    """
+    before, now = known.towards_sensor, source.towards_sensor
+    if before is None or now is None or not np.allclose(now, before):
+        source.towards_sensor = None

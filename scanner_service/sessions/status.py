@@ -1,7 +1,10 @@
 """What a session says of itself to people; knows nothing of how any of it came about."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+
+from scanner_service.storage.rows import Watermark
 
 STATES = ("created", "scanning", "paused", "interrupted", "stopped", "failed")
 
@@ -32,3 +35,11 @@ class Status:
     message: str | None
     held: bool
     holds: bool | None
+
+
+def durable_told(marks: Mapping[str, Watermark]) -> dict[str, dict[str, int]]:
+    """How far the lines of each device are durable."""
+    return {
+        device: {"boot_id": mark.boot_id, "line_index": mark.line_index, "lines": mark.line_count}
+        for device, mark in marks.items()
+    }

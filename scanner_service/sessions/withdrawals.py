@@ -1,8 +1,10 @@
-"""Passes that were taken out of the map or closed, as the record's events tell it; does neither itself."""
+"""Passes that are taken out of the map, and passes that were closed, as the record's events tell it."""
 
 from collections.abc import Iterable
 
 from scanner_service.analysis.passes import PassKey
+from scanner_service.sessions.engine import Engine
+from scanner_service.storage.record import Record
 from scanner_service.storage.rows import EventRow
 
 WITHDRAWN = "pass_withdrawn"
@@ -11,6 +13,18 @@ SCAN_ENDED = "losses"
 
 SERVICE_ENDED = "service_ended"
 """The event with which the next service says that the last one ended in the middle; it closes the passes too."""
+
+
+def withdraw(record: Record, engine: Engine, key: PassKey) -> int:
+    """Take a pass out of the map; returns how many points that were, 0 when it is unknown or withdrawn already.
+
+    Durable first: a map that forgot what the record still counts would differ after the next start.
+    """
+    named = {"device_id": key[0], "boot_id": key[1], "pass_index": key[2]}
+    if not engine.ask(lambda engine: engine.live_map.has_pass(key)).result():
+        return 0
+    record.append_event(engine.session_id, WITHDRAWN, named, timeout_s=5.0).result(30.0)
+    return engine.ask(lambda engine: engine.withdraw_pass(key)).result()
 
 
 def withdrawn_passes(events: Iterable[EventRow]) -> set[PassKey]:

@@ -219,7 +219,7 @@ def put_requirement(session: Session, body: RequirementIn) -> Response:
 
     It may be sent before, during and after a scan, and stays with the session; that it changed is an event.
     """
-    session.judge_by(body.to_requirement())
+    session.terms.judge_by(body.to_requirement())
     return answer(_requirement_answer(session))
 
 
@@ -227,14 +227,14 @@ def put_requirement(session: Session, body: RequirementIn) -> Response:
 def put_reference(request: Request, session: Session, body: ReferenceIn) -> Response:
     """Measure coverage against a nominal part in the replay folder; the answer comes when all is judged anew."""
     surface, spec = open_reference(ReferenceSpec(body.file, body.units), request.app.state.service.replay_dir)
-    session.measure_against(spec, Nominal(surface))
+    session.terms.measure_against(spec, Nominal(surface))
     return answer(_requirement_answer(session))
 
 
 @router.delete("/{session_id}/reference", dependencies=[operator])
 def delete_reference(session: Session) -> Response:
     """Measure coverage against the surface seen again."""
-    session.measure_against(None, NO_NOMINAL)
+    session.terms.measure_against(None, NO_NOMINAL)
     return answer(_requirement_answer(session))
 
 

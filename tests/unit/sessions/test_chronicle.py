@@ -57,8 +57,8 @@ def test_events_stand_in_their_order_when_the_first_had_to_wait(record):
     session_id = record.create_session("ordered").session_id
     pen = Chronicle(record, session_id)
     with Blockade(record):
-        pen.event("pass_accepted", {"order": 1}, patience_s=0.0)
-        pen.event("pass_moved", {"order": 1}, patience_s=0.0)
+        pen.event("pass_accepted", {"order": 1})
+        pen.event("pass_moved", {"order": 1})
     pen.event("pass_started", {"order": 1})
     assert [kind for kind, _ in settled(record, session_id)] == ["pass_accepted", "pass_moved", "pass_started"]
 
@@ -68,7 +68,7 @@ def test_what_is_owed_is_written_in_its_order_when_the_disk_is_watched(record):
     pen = Chronicle(record, session_id)
     with Blockade(record):
         for number in range(5):
-            pen.event("step", {"number": number}, patience_s=0.0)
+            pen.event("step", {"number": number})
         pen.watch_the_disk(Ledger(), 0.0)  # the record takes none: none changes its place
     pen.watch_the_disk(Ledger(), 1.0)
     pen.close()
@@ -81,7 +81,7 @@ def test_events_that_are_too_many_to_wait_are_counted_where_they_stood(record, m
     pen = Chronicle(record, session_id)
     with Blockade(record):
         for number in range(7):
-            pen.event("step", {"number": number}, patience_s=0.0)
+            pen.event("step", {"number": number})
     pen.close()
     assert settled(record, session_id) == [
         (EVENTS_LOST, {"record_busy": 4}),
@@ -104,7 +104,7 @@ def test_a_session_that_closes_writes_what_it_owes(record):
     session.stop()
     session_id = session.row.session_id
     with Blockade(record):
-        session._chronicle.event("last", {}, patience_s=0.0)
+        session._chronicle.event("last", {})
         session._closing.set()  # the analyst looks at the disk no more
         session._analyst.join()
     book.close()

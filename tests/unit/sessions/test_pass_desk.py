@@ -156,7 +156,7 @@ def test_a_plan_is_made_again_for_another_nominal_part(book, scanned):
     needed_mm2 = []
     for way_mm in (0.0, 20.0):  # the second part goes on where nobody scanned
         part = ReferenceSurface.of(box_corners(low - np.array([0.0, way_mm, 5.0]), high))
-        session.measure_against(None, Nominal(part))
+        session.terms.measure_against(None, Nominal(part))
         plan = desk.plan()
         assert desk.plan() is plan
         needed_mm2.append(plan.needed_mm2)
@@ -313,7 +313,7 @@ def test_a_pass_that_was_stopped_or_failed_teaches_nothing(book, scanned, tmp_pa
         if failure is None:
             session.stop()
         else:
-            session.ended(failure)
+            session.hearing.ended(failure)
         desk.wait_for(order)
         assert order.status is (PassStatus.DONE if failure is None else PassStatus.FAILED)
         assert not order.reached_end and not order.teaches

@@ -2,6 +2,7 @@
 
 import os
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from scanner_service.rescan.requirement import Requirement, RequirementUnusable
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SessionBusy, SourceUnusable
+from scanner_service.sessions.ledger import Ledger
 from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec
@@ -45,17 +47,134 @@ def test_a_replay_is_judged_before_it_is_over(book):
     assert session.results().snapshot.lines.line_index.tolist() == list(range(12))
 
 
-def test_a_scan_is_over_when_its_last_line_is_durable(book):
-    goes_on = threading.Event()
+class Disk:
+    """A disk that does not answer from `fails` on, until somebody waits for the ledger, and lets it `go_on`."""
 
+    def __init__(self, monkeypatch, record):
+        self.is_waited_for = threading.Event()
+        self.go_on = threading.Event()
+        self._record = record
+        waiting = Ledger.wait_until_decided
+
+        def told(ledger, timeout_s):
+            self.is_waited_for.set()
+            self.go_on.wait()
+            return waiting(ledger, timeout_s)
+
+        monkeypatch.setattr(Ledger, "wait_until_decided", told)
+
+    def fails(self):
+        begun = threading.Event()
+        self._record._writer.submit(lambda batch: (begun.set(), self.go_on.wait()), 0, 0.0)
+        begun.wait()
+
+
+@pytest.fixture
+def disk(book, monkeypatch):
+    disk = Disk(monkeypatch, book.record)
+    yield disk
+    disk.go_on.set()
+
+
+@pytest.fixture
+def aside():
+    """Runs what might never return."""
+    with ThreadPoolExecutor(4) as pool:
+        yield pool.submit
+
+
+def test_a_scan_is_over_when_its_last_line_is_durable(book, disk, aside):
     def lines():
-        book.record._writer.submit(lambda batch: goes_on.wait(20), 0, 0.0)  # a commit that takes its time
+        disk.fails()
         yield from LINES
-        threading.Timer(1.0, goes_on.set).start()
 
-    session = replay(book, lines())
+    session = book.create("test", PushSpec(), SETTINGS, source=ReplaySource(lines(), len(LINES)))
+    session.start()
+    aside(lambda: disk.is_waited_for.wait(60) and disk.go_on.set())  # the disk goes on when it is waited for, only then
+    over = session.wait_until_over(300)
+    disk.go_on.set()
+    assert over
+    assert session.wait_until_over(30)
     (ended,) = (event.details["lines"] for event in session.past_events() if event.kind == SCAN_ENDED)
     assert (ended["pending"], ended["stored"]) == (0, 12)
+
+
+def test_while_the_last_lines_wait_for_the_disk_nobody_else_does(book, disk, aside):
+    session = book.create("test", PushSpec(), SETTINGS)
+    session.start()
+    disk.fails()
+    replies = [session.push(line) for line in LINES]
+    stopping = aside(session.stop)
+    assert disk.is_waited_for.wait(60)
+    for verb in (session.start, session.pause, session.resume, lambda: session.push(LINES[0])):
+        with pytest.raises(SessionBusy, match="being stopped"):
+            aside(verb).result(60)
+    status = aside(session.status).result(60)
+    assert (status.state, status.losses["lines"]["pending"]) == ("scanning", 12)
+    again = aside(session.stop)  # whoever wants the same waits until it is done
+    disk.go_on.set()
+    stopping.result(60)
+    again.result(60)
+    assert session.state == book.record.get_session(session.row.session_id).state == "stopped"
+    assert {reply.result(60).outcome for reply in replies} == {"stored"}
+
+
+def crossing(monkeypatch, record, verb):
+    """The first call of a record's verb is kept between its answer and its caller; `done` lets it go."""
+    reached, done, call = threading.Event(), threading.Event(), getattr(record, verb)
+
+    def kept(*of):
+        answer = call(*of)
+        if not reached.is_set():
+            reached.set()
+            assert done.wait(60)
+        return answer
+
+    monkeypatch.setattr(record, verb, kept)
+    return reached, done
+
+
+@pytest.mark.parametrize("late", ["change_settings", "get_session"])
+def test_a_new_name_and_another_requirement_cross_and_both_stay(book, monkeypatch, aside, late):
+    session = book.create("old", PushSpec(), SETTINGS)
+    asked = Requirement(density_per_mm2=90.0)
+    changes = {
+        "change_settings": lambda: session.terms.judge_by(asked),
+        "get_session": lambda: book.describe(session.row.session_id, name="new", notes="seen"),
+    }
+    reached, done = crossing(monkeypatch, book.record, late)
+    first = aside(changes.pop(late))
+    assert reached.wait(60)
+    aside(*changes.values()).result(60)
+    done.set()
+    first.result(60)
+    assert (session.row.name, session.row.notes, session.settings.target) == ("new", "seen", asked)
+    assert session.row.settings["target"] == book.record.get_session(session.row.session_id).settings["target"]
+
+
+def test_of_two_names_that_cross_the_one_in_the_record_is_told(book, monkeypatch, aside):
+    session = book.create("old", PushSpec(), SETTINGS)
+    reached, done = crossing(monkeypatch, book.record, "get_session")
+    first = aside(lambda: book.describe(session.row.session_id, name="first"))
+    assert reached.wait(60)
+    aside(lambda: book.describe(session.row.session_id, name="second")).result(60)
+    done.set()
+    first.result(60)
+    assert session.row.name == book.record.get_session(session.row.session_id).name == "second"
+
+
+def test_a_session_that_is_renamed_while_it_is_reopened_has_the_new_name(tmp_path, monkeypatch):
+    with Record.open(tmp_path / "record.sqlite") as record:
+        session_id = record.create_session("old", settings=SETTINGS.to_dict(), source=PushSpec().to_dict()).session_id
+        book, lines = SessionBook(record), record.lines
+
+        def lines_of_the_renamed(*of, **more):
+            book.describe(session_id, name="new")
+            return lines(*of, **more)
+
+        monkeypatch.setattr(record, "lines", lines_of_the_renamed)
+        assert book.get(session_id).row.name == "new"
+        book.close()
 
 
 def test_a_source_that_breaks_down_fails_its_session_with_what_was_scanned(book):
@@ -171,10 +290,10 @@ def test_what_is_asked_for_later_outlasts_the_service_with_its_regions(tmp_path)
         book = SessionBook(record)
         session = replay(book, LINES)
         assert session.results().regions == ()
-        session.judge_by(asked)
+        session.terms.judge_by(asked)
         (region,) = session.results().regions
         with pytest.raises(RequirementUnusable, match="own noise"):
-            session.judge_by(Requirement(noise_mm=1e-6))
+            session.terms.judge_by(Requirement(noise_mm=1e-6))
         assert session.settings.target == asked
         book.close()
     with Record.open(tmp_path / "record.sqlite") as record:
