@@ -289,7 +289,7 @@ def _guarded(failures: list[BaseException], work: Callable[[], None]) -> None:
 
 
 def _push(client: Client, pushed: Pushed, target: int, done: threading.Event, seed: int) -> None:
-    """Push until the first `target` lines are acknowledged, and on without waiting for the answer: the kill is there."""
+    """Push until the first `target` lines are acknowledged, and on without waiting: the kill comes there."""
     try:
         index = push_until(client, pushed, target, done, seed)
     except BaseException:
