@@ -7,11 +7,11 @@ import sys
 from tests.end_to_end.running import ROOT
 
 
-def rescan(service, session_id, *arguments):
+def rescan(service, session_id, *arguments, patience_s=500):
     command = [sys.executable, "-m", "scanner_service", "rescan", session_id, *arguments, "--json"]
     return subprocess.run(
         [*command, "--data", str(service.data), "--url", service.url],
-        capture_output=True, text=True, cwd=ROOT, timeout=110, check=False,
+        capture_output=True, text=True, cwd=ROOT, timeout=patience_s, check=False,
     )  # fmt: skip
 
 
@@ -47,7 +47,7 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     exported = subprocess.run(
         [sys.executable, "-m", "scanner_service", "export", session_id, "--data", str(service.data),
          "--format", "results", "--out", str(tmp_path)],
-        capture_output=True, text=True, cwd=ROOT, timeout=110, check=False,
+        capture_output=True, text=True, cwd=ROOT, timeout=300, check=False,
     )  # fmt: skip
     assert exported.returncode == 0, exported.stderr
     written = json.loads(next(tmp_path.rglob("regions.json")).read_text())
