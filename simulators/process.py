@@ -5,6 +5,7 @@ A parent talks to it in lines: it prints one JSON object a line, and takes one c
 """
 
 import argparse
+import contextlib
 import json
 import os
 import secrets
@@ -27,6 +28,14 @@ from simulators.meshes import MeshError
 from simulators.optics import LaserLineScanner, demo_scanner
 from simulators.parts import PARTS, Part, mesh_part
 from simulators.pty_port import PtyPort, SimulatedPortError, UnknownDevice
+from simulators.turntable import (
+    ENCODER_MM_PER_COUNT,
+    STAGE_BAUD_RATE,
+    Table,
+    rig_text,
+    turned_part,
+    turned_scene,
+)
 
 DEFAULT_BAUD_RATE = 3_000_000
 """Of the native device; the others begin at the rate that their originals have when they are switched on."""
@@ -73,11 +82,13 @@ def simulated_device(
     boot_id: int | None = None,
     part_from_sensor: Pose | None = None,
     dead_man_s: float = PATIENT_DEAD_MAN_S,
+    table: Table | None = None,
 ) -> NativeDevice:
     """A scanner over `part` that speaks the native protocol.
 
     `part_from_sensor` is its mounting with the stage at 0 (identity: stage position and part y are the same); the stage
-    travels along the part's y. A boot id is drawn anew when none is given, since no two boots may share one.
+    travels along the part's y. With a `table` the part turns before it instead, and it reads the table's encoder. A
+    boot id is drawn anew when none is given, since no two boots may share one.
     """
     optics = scanner or demo_scanner()
     scene_rng, device_rng = rng.spawn(2)
@@ -90,6 +101,16 @@ def simulated_device(
         points_per_line=optics.points_per_line,
         geometry=optics.geometry(),
     )
+    if table is not None:
+        return NativeDevice(
+            info,
+            turned_scene(optics, part, scene_rng),
+            rng=device_rng,
+            buffer_bytes=BUFFER_BYTES,
+            encoder_mm_per_count=ENCODER_MM_PER_COUNT,
+            encoder_mm=table.encoder_mm,
+            dead_man_s=dead_man_s,
+        )
     scene = Scene(optics, part, scene_rng, part_from_sensor)
     return NativeDevice(
         info, scene, rng=device_rng, travel_mm=STAGE_MM, buffer_bytes=BUFFER_BYTES, dead_man_s=dead_man_s
@@ -110,6 +131,8 @@ def serve_simulated_scanner(
     device_id: str = "SIM-0001",
     boot_id: int | None = None,
     dead_man_s: float = PATIENT_DEAD_MAN_S,
+    turntable: bool = False,
+    rig_file: Path | None = None,
     commands: int | None = None,
 ) -> None:
     """Serve a simulated scanner in the calling thread until `stop` is set, or until `commands` ends or says so.
@@ -124,6 +147,8 @@ def serve_simulated_scanner(
     seed : of the noise, the dropouts and the faults.
     link_path : a symbolic link that always names the present terminal.
     dead_man_s : how long the native device scans on without a word of its host.
+    turntable : the part stands on a turntable with a terminal of its own, and the native scanner reads its encoder.
+    rig_file : written once the terminals are there: the rig file that puts scanner and turntable together.
     commands : a file descriptor with one command a line; None: there are none.
 
     Raises
@@ -133,9 +158,18 @@ def serve_simulated_scanner(
     scene_rng, wire_rng = np.random.default_rng(seed).spawn(2)
     actions: dict[str, Callable[[], None]] = {}
     extras: Event = {"travel_mm": list(part.travel_mm), "part": part.description, "seed": seed}
+    table, stage_port = None, None
+    if turntable:
+        if kind != "native":
+            raise UnknownDevice(f"{kind} reads no encoder: a turntable stands before a native scanner only")
+        table = Table()
+        stage_port = PtyPort(table, STAGE_BAUD_RATE)
+        actions |= {"unplug_stage": stage_port.unplug, "replug_stage": stage_port.replug}
     if kind == "native":
         native_rate = DEFAULT_BAUD_RATE if baud_rate is None else baud_rate
-        native = simulated_device(part, scene_rng, device_id=device_id, boot_id=boot_id, dead_man_s=dead_man_s)
+        native = simulated_device(
+            part, scene_rng, device_id=device_id, boot_id=boot_id, dead_man_s=dead_man_s, table=table
+        )
         port = PtyPort(native, native_rate, faults, link_path=link_path, rng=wire_rng)
         actions["reboot"] = lambda: port.in_loop(native.reboot)
         extras["baud_rate"] = native_rate
@@ -157,10 +191,14 @@ def serve_simulated_scanner(
         where = str(port.path) if port.is_plugged else None
         return {"event": name, "port": where} | identity()
 
-    with port:
+    with port, stage_port or contextlib.nullcontext():
         # Opening a terminal throws away what waits in it: half of the greeting, if it is still on its way.
         while not (port.is_quiet or port.has_failed or stop.is_set()):
             stop.wait(0.002)
+        if stage_port is not None:
+            extras |= {"stage_port": str(stage_port.path), "rig_file": None if rig_file is None else str(rig_file)}
+            if rig_file is not None:
+                rig_file.write_text(rig_text(port.path, native_rate, stage_port.path))
         announce(event("ready") | extras)
         unread = b""
         while not (stop.is_set() or port.has_failed):
@@ -202,7 +240,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(number, lambda *_: stop.set())
     try:
         serve_simulated_scanner(
-            mesh_part(given.mesh, given.scale) if given.mesh else PARTS[given.part](),
+            _part(given),
             stop=stop,
             announce=lambda event: print(json.dumps(event), flush=True),
             kind=given.device,
@@ -214,6 +252,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             device_id=given.device_id,
             boot_id=given.boot_id,
             dead_man_s=given.dead_man,
+            turntable=given.turntable,
+            rig_file=given.rig_file,
             commands=_piped_input(),
         )
     except (SimulatedPortError, MeshError, ValueError) as error:
@@ -226,13 +266,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _part(given: argparse.Namespace) -> Part:
+    if given.turntable:
+        return turned_part()
+    return mesh_part(given.mesh, given.scale) if given.mesh else PARTS[given.part]()
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m simulators", description="A simulated laser-line scanner on a pty."
     )
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--part", choices=sorted(PARTS), default="demo", help="the part under the scanner")
+    what.add_argument("--turntable", action="store_true", help="a part on a turntable, which has a terminal of its own")
     what.add_argument("--mesh", type=Path, metavar="FILE", help="a mesh instead: .stl, .obj or .ply")
+    parser.add_argument("--rig-file", type=Path, metavar="FILE", help="write the rig file of scanner and turntable")
     parser.add_argument("--scale", type=float, default=1.0, help="millimetres in one unit of the mesh")
     parser.add_argument("--link", type=Path, metavar="PATH", help="a symbolic link that always names the terminal")
     parser.add_argument("--device", choices=["native", *KNOWN_DEVICES], default="native", help="the kind of scanner")

@@ -10,8 +10,11 @@ from drivers.passes.speeds import line_rate
 from drivers.protocols.scanner_events import Advice, PassEnded, PassNotResumed
 from drivers.rig_description import PairBy
 from drivers.scanners.native import NativeScanner
+from drivers.stages.face import DrivenStage
 from drivers.stages.unmoved import ConstantSpeed
 
+_SILENCE_S = 30.0
+"""After so long at rest without a line a scanner that reads an encoder will not see the places that it waits for."""
 _WIRE_SHARE = 0.95
 """Share of the wire's time that lines may fill where the rig chooses their rate: answers need the rest."""
 
@@ -35,6 +38,7 @@ def run_with_device(drive: PassDrive, scanner: NativeScanner) -> str:
             drive.start_move(drive.driven, order.end_mm, rate_hz * order.line_spacing_mm)
     elif isinstance(drive.stage, ConstantSpeed):
         drive.stage.begin(order.start_mm, order.end_mm)
+    silent_since_s = drive.clock()
     while True:
         profiles = drive.fetch(LOOK_S)
         lines.read(drive.stage.readings())
@@ -47,6 +51,13 @@ def run_with_device(drive: PassDrive, scanner: NativeScanner) -> str:
         is_over = isinstance(ended, PassNotResumed) or (ended is not None and ended.reason != "rebooted")
         if drive.stopping.is_set() and not is_over:
             scanner.stop_pass()
+        elif not is_over and drive.driven is not None:
+            silent_since_s = drive.clock() if profiles or not _rests(drive, drive.driven) else silent_since_s
+            if drive.clock() - silent_since_s > _SILENCE_S:
+                drive.told.event(
+                    Advice("the stage rests, and the scanner still waits for places: check encoder, start and end")
+                )
+                scanner.stop_pass()
         lines.settle(is_over=is_over)
         drive.seen.clear()
         drive.stage_events()
@@ -54,6 +65,16 @@ def run_with_device(drive: PassDrive, scanner: NativeScanner) -> str:
             raise ScannerSilent(ended.reason)
         if is_over and ended is not None:
             return ended.reason
+
+
+def _rests(drive: PassDrive, stage: DrivenStage) -> bool:
+    """True when the stage is where it was sent; raises a StageError where it will not get there."""
+    try:
+        return stage.finish_move(0.0) is not None
+    except StageStopped:
+        if drive.stopping.is_set():  # the scanner is stopped in the next round
+            return False
+        raise
 
 
 def _rate_that_fits(drive: PassDrive, most_hz: float) -> float:

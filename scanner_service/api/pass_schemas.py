@@ -8,6 +8,7 @@ from pydantic import Field
 
 from drivers.rig_limits import AxisKind, RigLimits
 from drivers.scanline import SensorGeometry
+from scanner_service.api.errors import ValueUnusable
 from scanner_service.api.schemas import Finite, Strict, Vector
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.errors import RigUnlimited
@@ -83,6 +84,20 @@ class RigIn(Strict):
             geometry, optics.field_of_view_mm, optics.points_per_line, math.radians(optics.max_incidence_deg)
         )
         return RigSetup(reach, stated, driven_by_client=self.driven_by_client)
+
+
+class AcceptIn(Strict):
+    """The plan in which the pass was seen, as the list of recommended passes names it."""
+
+    plan: Annotated[str, Field(min_length=1, max_length=64)] | None = None
+
+    def seen(self) -> str:
+        """The plan's name; raises ValueUnusable without it: a number alone may mean another pass."""
+        if self.plan is None:
+            raise ValueUnusable(
+                'say in which plan the pass was seen: {"plan": "…"}, as the list of recommended passes names it'
+            )
+        return self.plan
 
 
 class CarryOutIn(Strict):

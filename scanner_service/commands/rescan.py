@@ -20,6 +20,7 @@ _OVER = ("done", "failed", "cancelled")
 def rescan_command(
     session: Annotated[str, typer.Argument(help="The session's id, its first letters, or `latest`.")],
     carry_out: Annotated[int | None, typer.Option("--pass", help="Carry out this pass of the list.")] = None,
+    plan: Annotated[str | None, typer.Option("--plan", help="The plan that --pass was listed in.")] = None,
     turned: Annotated[bool, typer.Option("--turned", help="The part lies as the pass asks.")] = False,
     auto: Annotated[bool, typer.Option("--auto", help="Repeat until nothing is left to do.")] = False,
     cancel: Annotated[int | None, typer.Option("--cancel", help="Give up this accepted order.")] = None,
@@ -35,6 +36,11 @@ def rescan_command(
     with plain_errors():
         if sum((auto, carry_out is not None, cancel is not None)) > 1:
             fail("say one of --pass, --auto and --cancel")
+        if (carry_out is None) != (plan is None):
+            fail(
+                "say --pass and --plan together: the plan is named below the list of passes, and what the number means "
+                "depends on it"
+            )
         serving: Serving = {"region": region or [], "reason": reason or []}
         with running_service(data, url) as client:
             where = f"/api/v1/sessions/{named(client, session)}"
@@ -42,8 +48,8 @@ def rescan_command(
                 limits = {"max_passes": max_passes, "max_seconds": max_seconds}
                 chosen = {"regions": serving["region"], "reasons": serving["reason"]}
                 result = _loop(client, where, limits | chosen, as_json)
-            elif carry_out is not None:
-                result = _one(client, where, carry_out, turned, serving)
+            elif carry_out is not None and plan is not None:
+                result = _one(client, where, carry_out, plan, turned, serving)
             elif cancel is not None:
                 result = _ask(client.delete(f"{where}/pass-orders/{cancel}"))
             else:
@@ -76,14 +82,14 @@ def _loop(client: httpx.Client, where: str, limits: dict[str, Any], quiet: bool)
         time.sleep(_POLL_S)
 
 
-def _one(client: httpx.Client, where: str, number: int, turned: bool, serving: Serving) -> dict[str, Any]:
+def _one(client: httpx.Client, where: str, number: int, plan: str, turned: bool, serving: Serving) -> dict[str, Any]:
     """Accept a pass, carry it out and wait for its end; a hand is guided meanwhile. One refused is cancelled."""
-    order = _ask(client.post(f"{where}/recommended-passes/{number}/accept", params=serving))
+    order = _ask(client.post(f"{where}/recommended-passes/{number}/accept", params=serving, json={"plan": plan}))
     mine = f"{where}/pass-orders/{order['order']}"
     errors.print(f"order {order['order']}: {_said(order)}", highlight=False, soft_wrap=True)
     if turned and order["pass"]["turn_part"] is None:
         client.delete(mine)
-        fail(f"pass {number} of the plan as it is now asks for no turn of the part: list the plan again")
+        fail(f"pass {number} of plan {plan} asks for no turn of the part: leave out --turned")
     _ask(client.post(f"{mine}/carry-out", json={"part_is_turned": turned}))
     by_hand = _ask(client.get(where))["source"]["kind"] == "push"
     said = ""
@@ -139,6 +145,9 @@ def _tell_plan(plan: dict[str, Any]) -> None:
     for lost in plan["unreachable"]:
         what = "surface outside of any region" if lost["region"] is None else f"region {lost['region']}"
         console.print(f"{what}: {lost['area_mm2']:.1f} mm² unreachable: {lost['why']}", highlight=False, soft_wrap=True)
+    if plan["passes"]:
+        said = f"This is plan {plan['plan']}; --pass NUMBER --plan {plan['plan']} carries one out."
+        console.print(said, highlight=False, soft_wrap=True)
 
 
 def _served(one: dict[str, Any]) -> str:

@@ -14,8 +14,9 @@ from scanner_service.rescan.passes.errors import PlanningError
 from scanner_service.rescan.passes.recommendation import Plan
 from scanner_service.rescan.passes.serving import EVERYTHING, Serving
 from scanner_service.rescan.region import RegionStatus
-from scanner_service.sessions.errors import SessionError
+from scanner_service.sessions.errors import PlanOvertaken, SessionError
 from scanner_service.sessions.pass_orders import PassOrder, PassStatus
+from scanner_service.sessions.pass_planning import name_of
 from scanner_service.sessions.results import Results
 
 _LOG = logging.getLogger(__name__)
@@ -67,11 +68,11 @@ class LoopDesk(Protocol):
     def plan(self, serving: Serving) -> Plan:
         """Recommended passes for it."""
 
-    def accept(self, number: int, serving: Serving) -> PassOrder:
-        """Take an order."""
+    def accept(self, number: int, serving: Serving, seen: str) -> PassOrder:
+        """Take an order for a pass of the plan that was seen; raises PlanOvertaken."""
 
     def carry_out(self, order_id: int) -> PassOrder:
-        """Begin with it; one that is refused is cancelled with the reason."""
+        """Begin with it; one that is refused is cancelled, one whose devices do not set off fails, with the reason."""
 
     def wait_for(self, order: PassOrder) -> None:
         """Return when it is over."""
@@ -109,11 +110,19 @@ def _step(desk: LoopDesk, loop: LoopState) -> str | None:
         return f"the limit of {limits.max_passes} passes is met"
     if loop.seconds + seconds > limits.max_seconds:
         return f"the limit of {limits.max_seconds:g} s is met"
-    order = desk.accept(best.number, limits.serving)
-    desk.carry_out(order.order_id)
+    try:
+        order = desk.accept(best.number, limits.serving, name_of(plan))
+    except PlanOvertaken:
+        return None  # it is planned anew
+    try:
+        desk.carry_out(order.order_id)
+    except (SessionError, DriverError, PlanningError) as error:
+        return f"pass order {order.order_id} {order.status.value}: {error}"
     loop.passes, loop.seconds = loop.passes + 1, loop.seconds + seconds
     desk.wait_for(order)
-    return order.message if order.status is PassStatus.FAILED else order.doubt
+    if order.status is PassStatus.FAILED:
+        return f"pass order {order.order_id} failed: {order.message}"
+    return order.doubt
 
 
 def _fulfilled(results: Results, limits: LoopLimits) -> str | None:

@@ -4,6 +4,7 @@ SessionError
 ├── SessionNotLive      the session is in the record, but not open
 ├── SessionBusy         the request does not fit the session's state
 ├── PassUnknown         no such recommended or accepted pass
+├── PlanOvertaken       the plan in which a pass was seen is not in force any more
 ├── BudgetSpent         the disk budget is used up, and no session may be deleted to make room
 ├── SourceUnusable      what the session should read from cannot be read
 ├── FileUnknown         no file of that name lies in the replay folder
@@ -29,6 +30,10 @@ class SessionBusy(SessionError):
 
 class PassUnknown(SessionError):
     """There is no recommended or accepted pass of that number."""
+
+
+class PlanOvertaken(SessionError):
+    """The plan in which a pass was seen is not in force any more."""
 
 
 class BudgetSpent(SessionError):

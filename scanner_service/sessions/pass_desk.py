@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.errors import DriverError
 from drivers.scanline import Pose
 from scanner_service.rescan.passes.guidance import Guidance, guide, reaches_end
 from scanner_service.rescan.passes.outcome import reckon
@@ -18,7 +19,7 @@ from scanner_service.rescan.passes.tried import Tried
 from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.closed_loop import LoopLimits, LoopState, run
-from scanner_service.sessions.errors import PassUnknown, SessionBusy, SessionError
+from scanner_service.sessions.errors import SessionBusy, SessionError, SourceUnusable
 from scanner_service.sessions.pass_orders import (
     ACCEPTED,
     CANCELLED,
@@ -30,7 +31,7 @@ from scanner_service.sessions.pass_orders import (
     accepted_event,
     outcome_event,
 )
-from scanner_service.sessions.pass_planning import PlanQuestion, driven_by, outcomes_of
+from scanner_service.sessions.pass_planning import PlanQuestion, driven_by, outcomes_of, wanted_of
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.rig_setups import RigSetup, is_driven, setup_of, start_pass
 from scanner_service.sessions.session import LiveSession
@@ -47,7 +48,7 @@ class PassDesk:
         self._rigs = rigs  # the folder in which rig files lie
         self._lock = threading.RLock()  # held for moments only: whoever asks is answered at once
         self._planning = threading.Lock()  # one plan is made at a time
-        self._starting = threading.RLock()  # one pass is started at a time
+        self._setting_off: int | None = None  # the order whose pass is just being started: one at a time
         self._tasks = 0  # passes and loops under way
         self._changes = 0  # of what plans are made from
         self._setup: RigSetup | None = None
@@ -81,43 +82,47 @@ class PassDesk:
         PlanningError : the rig or the optics are not known.
         SessionError : the session is closed, or there is no such region.
         """
-        serving = serving or EVERYTHING
         with self._planning:
-            plan, results = self._current_plan(serving)
-            if results is not None and serving == EVERYTHING:
-                self._mark(results, plan)
-            return plan
+            return self._planned(serving or EVERYTHING)
 
-    def accept(self, number: int, serving: Serving | None = None) -> PassOrder:
-        """Take an order for a pass of the latest plan.
+    def accept(self, number: int, serving: Serving | None = None, seen: str | None = None) -> PassOrder:
+        """Take an order for a pass of the plan in force.
+
+        Parameters
+        ----------
+        seen : the name (`name_of`) of the plan in which somebody saw the pass; None takes what is in force.
 
         Raises
         ------
+        PlanOvertaken : the plan that was seen is not in force any more.
         PassUnknown : there is no such pass in the plan.
         """
-        plan = self.plan(serving)
-        with self._lock:
-            wanted = next((one for one in plan.passes if one.number == number), None)
-            if wanted is None:
-                raise PassUnknown(
-                    f"there is no pass {number} in the plan for version {plan.version} of the map, which has "
-                    f"{len(plan.passes)}; list the recommended passes again"
-                )
-            order = self._orders.take(wanted, plan.version)
-            self._session.event(ACCEPTED, accepted_event(order))
-        return order
+        with self._planning:  # nobody plans anew meanwhile
+            while True:
+                plan = self._planned(serving or EVERYTHING)
+                with self._lock:
+                    if self._plan is not plan:  # what it was made from has changed since
+                        continue
+                    wanted = wanted_of(plan, number, seen)
+                    order = self._orders.take(wanted, plan.version)
+                    self._session.event(ACCEPTED, accepted_event(order))
+                    return order
 
-    def cancel(self, order_id: int, why: str = "cancelled by the user") -> PassOrder:
-        """Give an accepted pass up before it is carried out; raises PassUnknown, SessionBusy."""
-        with self._starting, self._lock:  # one that is just being started is not cancelled any more
-            order = self._orders.cancel(order_id, why)
-            self._session.event(CANCELLED, {"order": order_id, "message": why})
-        return order
+    def cancel(self, order_id: int) -> PassOrder:
+        """Give an accepted pass up before it is carried out, at once; raises PassUnknown, SessionBusy."""
+        with self._lock:
+            if self._setting_off == order_id:
+                raise SessionBusy(
+                    f"pass order {order_id} is just being set off and cannot be cancelled any more: stop the session "
+                    "once it scans"
+                )
+            return self._give_up(order_id, "cancelled by the user")
 
     def carry_out(self, order_id: int, part_is_turned: bool = False) -> PassOrder:
         """Drive an accepted pass; pushed scanlines are waited for where a client or a hand moves the scanner.
 
-        A refused order is cancelled with the reason, whoever gave it; accept it again when that is mended.
+        A refused order is cancelled with the reason, whoever gave it; accept it again when that is mended. One whose
+        devices do not set off has failed, with the reason.
 
         Parameters
         ----------
@@ -129,18 +134,14 @@ class PassDesk:
         PlanningError : the rig cannot carry it out.
         SourceUnusable, DriverError : the pass could not be started.
         """
-        with self._starting:
-            order = self.order(order_id)
-            if order.status is not PassStatus.ACCEPTED:
-                raise SessionBusy(f"pass order {order_id} is {order.status.value}: accept a pass of a new plan")
-            self._task(+1)
-            try:
-                before, setup = self._begun(order, part_is_turned)
-            except Exception as error:
-                self._task(-1)
-                self.cancel(order_id, str(error))
-                raise
-            order.status = PassStatus.RUNNING
+        order = self._claimed(order_id)
+        try:
+            before, setup = self._begun(order, part_is_turned)
+        except Exception as error:
+            self._not_begun(order, error)
+            raise
+        with self._lock:
+            order.status, self._setting_off = PassStatus.RUNNING, None
         self._session.event(STARTED, {"order": order.order_id})
         threading.Thread(
             target=self._follow, args=(order, before, setup), name=f"pass-{self._session.row.session_id}", daemon=True
@@ -244,6 +245,13 @@ class PassDesk:
         """What is planned from is not what it was; the lock is held."""
         self._plan, self._changes = None, self._changes + 1
 
+    def _planned(self, serving: Serving) -> Plan:
+        """See `plan`; one thread at a time comes here."""
+        plan, results = self._current_plan(serving)
+        if results is not None and serving == EVERYTHING:
+            self._mark(results, plan)
+        return plan
+
     def _current_plan(self, serving: Serving) -> tuple[Plan, Results | None]:
         """The plan for the map as it is, and the verdict it was made from where it was made just now.
 
@@ -265,14 +273,49 @@ class PassDesk:
                     self._plan, self._planned_for, self._planned_against = plan, wanted, nominal
                     return plan, results
 
+    def _claimed(self, order_id: int) -> PassOrder:
+        """The order, now being set off; raises SessionBusy, and cancels it when that is for another on its way."""
+        with self._lock:
+            order = self._orders.get(order_id)
+            if order.status is not PassStatus.ACCEPTED or self._setting_off == order_id:
+                state = "being set off" if self._setting_off == order_id else order.status.value
+                raise SessionBusy(f"pass order {order_id} is {state}: accept a pass of a new plan")
+            running = self._orders.running()
+            other = self._setting_off if running is None else running.order_id
+            if other is not None:
+                why = (
+                    f"pass order {other} is being carried out: wait until it is over, or stop the session, then accept "
+                    "a pass of the new plan"
+                )
+                self._give_up(order_id, why)
+                raise SessionBusy(why)
+            self._setting_off = order_id
+            self._tasks += 1
+        return order
+
+    def _give_up(self, order_id: int, why: str) -> PassOrder:
+        """Cancel an order; the lock is held."""
+        order = self._orders.cancel(order_id, why)
+        self._session.event(CANCELLED, {"order": order_id, "message": why})
+        return order
+
+    def _not_begun(self, order: PassOrder, error: Exception) -> None:
+        """An order whose pass was refused is cancelled; it has failed where the devices did not do what they should."""
+        try:
+            with self._lock:
+                self._setting_off = None
+                if not isinstance(error, DriverError | SourceUnusable):
+                    self._give_up(order.order_id, str(error))
+                    return
+                order.status, order.message = PassStatus.FAILED, str(error)
+                self._learn(order)
+            self._session.event(OUTCOME, outcome_event(order))
+        finally:
+            self._task(-1)
+            order.done.set()
+
     def _begun(self, order: PassOrder, part_is_turned: bool) -> tuple[Results, RigSetup]:
         """Start the pass of an order; the verdict before it, and the rig that it goes with. Raises as `carry_out`."""
-        other = self._orders.running()
-        if other is not None:
-            raise SessionBusy(
-                f"pass order {other.order_id} is being carried out: wait until it is over, or stop the session, "
-                "then accept a pass of the new plan"
-            )
         turn = order.planned.turn
         if turn is not None and not turn.is_none and not part_is_turned:
             raise SessionBusy(

@@ -1,5 +1,7 @@
 """All that a plan of passes is made from, gathered at one moment, and the plan made of it; owns no state or lock."""
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,14 +13,15 @@ from scanner_service.rescan.passes.looks import Look, look_of
 from scanner_service.rescan.passes.motion import Motion, StraightMotion
 from scanner_service.rescan.passes.outcome import Outcome
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
-from scanner_service.rescan.passes.recommendation import Plan
+from scanner_service.rescan.passes.recommendation import Plan, RecommendedPass
 from scanner_service.rescan.passes.serving import Serving
 from scanner_service.rescan.passes.tried import Tried
-from scanner_service.sessions.errors import PassUnknown
+from scanner_service.sessions.errors import PassUnknown, PlanOvertaken
 from scanner_service.sessions.pass_orders import PassOrder
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.rig_setups import RigSetup
 
+_NAME_LENGTH = 8
 Driven = tuple[int, Motion, float, float]
 """A pass as it was driven: its number in the map, its motion, where it started and ended."""
 
@@ -85,6 +88,36 @@ class PlanQuestion:
             if isinstance(motion, StraightMotion)
         ]
         return tuple(look for look in found if look is not None)
+
+
+def name_of(plan: Plan) -> str:
+    """A short name that two plans share only when they say the same: each number is the same pass, for the same gain.
+
+    The version of the map is left out: it also grows where nothing changes that a pass depends on.
+    """
+    said = json.dumps([one.to_dict() for one in plan.passes], sort_keys=True)
+    return hashlib.sha256(said.encode()).hexdigest()[:_NAME_LENGTH]
+
+
+def wanted_of(plan: Plan, number: int, seen: str | None) -> RecommendedPass:
+    """The pass of a number in the plan in force, which must be the one that was `seen` (None: whichever it is).
+
+    Raises
+    ------
+    PlanOvertaken : it is another one.
+    PassUnknown : there is no such pass in the plan.
+    """
+    if seen is not None and seen != name_of(plan):
+        raise PlanOvertaken(
+            f"this plan is no longer in force: map, requirement, rig or what is to be served is not what plan {seen} "
+            "was made for; list the passes again"
+        )
+    wanted = next((one for one in plan.passes if one.number == number), None)
+    if wanted is None:
+        raise PassUnknown(
+            f"there is no pass {number} in plan {name_of(plan)}, which has {len(plan.passes)}; list the passes again"
+        )
+    return wanted
 
 
 def outcomes_of(orders: Sequence[PassOrder]) -> tuple[Outcome, ...]:

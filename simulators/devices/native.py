@@ -42,6 +42,7 @@ Float64Array = npt.NDArray[np.float64]
 SceneLine = Callable[[float], tuple[Float64Array, Float64Array]]
 
 END_REPEAT_S = 0.2
+_ENCODER_LOOK_S = 0.002
 _LINES_AT_ONCE = 32  # at most so many are rendered in one call, so that commands are never kept waiting
 _U32 = 0xFFFFFFFF
 _POINT_LIMIT = 2**31 - 1
@@ -59,10 +60,15 @@ class _Pass:
     step_nm: int
     n_lines: int
     done_lines: int = 0
+    passed_s: float | None = None  # when the axis whose encoder is read has come to the next line
 
     @property
     def due_s(self) -> float:
-        return self.start_s + self.done_lines / self.rate_hz
+        return self.start_s + self.done_lines / self.rate_hz if self.passed_s is None else self.passed_s
+
+    @property
+    def place_nm(self) -> int:
+        return self.start_nm + self.done_lines * self.step_nm
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +92,8 @@ class NativeDevice:
     travel_mm : (lowest, highest) position of the stage; a START beyond it is refused.
     buffer_bytes : what may wait for the wire. Chunks that do not fit are dropped, and counted, when they are measured.
     encoder_mm_per_count : when given, positions are told in counts of this size, otherwise in nanometres.
+    encoder_mm : where a foreign axis stands at a time, when the scanner reads the encoder of one and has no stage of
+        its own: each line is then measured when the axis has come to its place, to a count, and not when it is due.
     first_sequence, first_line : where the counters of the first boot begin.
     """
 
@@ -99,6 +107,7 @@ class NativeDevice:
         travel_mm: tuple[float, float] = (-math.inf, math.inf),
         buffer_bytes: int = 32_768,
         encoder_mm_per_count: float = 0.0,
+        encoder_mm: Callable[[float], float] | None = None,
         dead_man_s: float = DEAD_MAN_S,
         first_sequence: int = 0,
         first_line: int = 0,
@@ -109,6 +118,7 @@ class NativeDevice:
         self._travel_mm = travel_mm
         self._buffer_bytes = buffer_bytes
         self._encoder_mm_per_count = encoder_mm_per_count
+        self._encoder_mm = encoder_mm
         self._dead_man_s = dead_man_s
         self._laser = tuple(round(float(mm) * TENTH_UM_PER_MM) for mm in info.geometry.laser_mm)
         self._boot(info, first_sequence, first_line)
@@ -182,7 +192,7 @@ class NativeDevice:
         self._watch(now_s)
         for _ in range(_LINES_AT_ONCE):
             self._fill(room_bytes)
-            if self._pass is None or self._pass.due_s > now_s:
+            if self._pass is None or not self._is_due(self._pass, now_s):
                 break
             self._measure(self._pass)
         if self._unseen_end_s is not None and now_s >= self._unseen_end_s and not self._queue:
@@ -199,7 +209,8 @@ class NativeDevice:
             return now_s
         due = []
         if self._pass is not None:
-            due.append(max(now_s, self._pass.due_s))
+            next_s = self._pass.due_s if self._encoder_mm is None else now_s + _ENCODER_LOOK_S
+            due.append(max(now_s, next_s))
         if self._unseen_end_s is not None:
             due.append(max(now_s, self._unseen_end_s))
         if self._laser_on or self.streaming:
@@ -269,10 +280,18 @@ class NativeDevice:
         self._queue.append(_Queued(b"", None))
         self._unseen_end_s = now_s + END_REPEAT_S
 
+    def _is_due(self, running: _Pass, now_s: float) -> bool:
+        """Whether the next line is to be measured: by the clock, or by how far the axis has come."""
+        if self._encoder_mm is None:
+            return running.due_s <= now_s
+        ahead_mm = self._encoder_mm(now_s) - running.place_nm / NM_PER_MM
+        running.passed_s = now_s
+        return math.copysign(1.0, running.step_nm) * ahead_mm >= -self._encoder_mm_per_count
+
     def _measure(self, running: _Pass) -> None:
         """Measure the line that is due, and queue its chunks as far as they fit."""
         due_s = running.due_s
-        stage_nm = running.start_nm + running.done_lines * running.step_nm
+        stage_nm = running.place_nm
         # Rendering a line of which nothing can be kept would only make a late simulator later.
         has_room = self._queued_bytes + 512 <= self._buffer_bytes
         n_points = self._info.points_per_line

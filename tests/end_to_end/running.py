@@ -95,7 +95,8 @@ class RunningSimulator:
 
     def __init__(self, part="plate", *arguments):
         patient = ["--dead-man", "60"]  # a busy machine is no host that is gone; a later argument says otherwise
-        command = [sys.executable, "-m", "simulators", "--part", part, *patient, *map(str, arguments)]
+        over = ["--turntable"] if part == "turntable" else ["--part", part]
+        command = [sys.executable, "-m", "simulators", *over, *patient, *map(str, arguments)]
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=os.environ
         )

@@ -7,11 +7,11 @@ import sys
 from tests.end_to_end.running import ROOT
 
 
-def rescan(service, session_id, *arguments):
+def rescan(service, session_id, *arguments, patience_s=500):
     command = [sys.executable, "-m", "scanner_service", "rescan", session_id, *arguments, "--json"]
     return subprocess.run(
         [*command, "--data", str(service.data), "--url", service.url],
-        capture_output=True, text=True, cwd=ROOT, timeout=110, check=False,
+        capture_output=True, text=True, cwd=ROOT, timeout=patience_s, check=False,
     )  # fmt: skip
 
 
@@ -47,13 +47,19 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     exported = subprocess.run(
         [sys.executable, "-m", "scanner_service", "export", session_id, "--data", str(service.data),
          "--format", "results", "--out", str(tmp_path)],
-        capture_output=True, text=True, cwd=ROOT, timeout=110, check=False,
+        capture_output=True, text=True, cwd=ROOT, timeout=300, check=False,
     )  # fmt: skip
     assert exported.returncode == 0, exported.stderr
     written = json.loads(next(tmp_path.rglob("regions.json")).read_text())
     for name in ("regions", "resolved"):
         assert written[name] == listed[name]
     refused = service.client.post(f"/api/v1/sessions/{session_id}/recommended-passes/99/accept")
+    assert refused.status_code == 422 and "which plan" in refused.json()["detail"]
+    where = f"/api/v1/sessions/{session_id}/recommended-passes"
+    seen = service.client.get(where).json()["plan"]
+    outdated = service.client.post(f"{where}/1/accept", json={"plan": "1" + seen[1:] if seen[0] != "1" else "2"})
+    assert (outdated.status_code, outdated.json()["type"]) == (409, "/problems/plan-overtaken")
+    refused = service.client.post(f"{where}/99/accept", json={"plan": seen})
     assert (refused.status_code, refused.headers["content-type"]) == (404, "application/problem+json")
     unclear = service.client.put(f"/api/v1/sessions/{session_id}/rig", json={
         "axis": "free_pose", "scanner": {"laser_mm": [0, 0, 150], "camera_mm": [0, 76, 150], "range_mm": [-30, 30],
@@ -72,15 +78,17 @@ def test_a_refused_pass_is_cancelled_and_says_what_to_do(running):
     session_id = service.client.post("/api/v1/sessions", json=body).json()["id"]
     service.start(session_id)
     service.wait_for_state(session_id, "stopped")
-    passes = json.loads(rescan(service, session_id, "--reason", "shadow").stdout)["passes"]
+    plan = json.loads(rescan(service, session_id, "--reason", "shadow").stdout)
+    passes = plan["passes"]
     assert all(item["region"] for one in passes for item in one["serves"])
     turned = next(one for one in passes if one["turn_part"])
-    refused = rescan(service, session_id, "--reason", "shadow", "--pass", str(turned["number"]))
+    refused = rescan(service, session_id, "--reason", "shadow", "--pass", str(turned["number"]), "--plan", plan["plan"])
     assert refused.returncode == 1 and "--turned" in refused.stderr
     orders = service.client.get(f"/api/v1/sessions/{session_id}/pass-orders").json()["orders"]
     assert [order["status"] for order in orders] == ["cancelled"]
     where = f"/api/v1/sessions/{session_id}"
-    order = service.client.post(f"{where}/recommended-passes/{turned['number']}/accept?reason=shadow").json()["order"]
+    order = service.client.post(f"{where}/recommended-passes/{turned['number']}/accept?reason=shadow",
+                                json={"plan": plan["plan"]}).json()["order"]  # fmt: skip
     begun = service.client.post(f"{where}/pass-orders/{order}/carry-out", json={"part_is_turned": False})
     assert begun.status_code == 409 and "accept the pass again" in begun.json()["detail"]
     told = service.client.get(f"{where}/pass-orders/{order}").json()

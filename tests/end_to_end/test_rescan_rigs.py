@@ -45,10 +45,11 @@ def rescan(service, session_id, *arguments):
     command = [sys.executable, "-m", "scanner_service", "rescan", session_id, *arguments]
     return subprocess.run(
         [*command, "--data", str(service.data), "--url", service.url],
-        capture_output=True, text=True, cwd=ROOT, timeout=110, check=False,
+        capture_output=True, text=True, cwd=ROOT, timeout=500, check=False,
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_the_loop_drives_the_rig_of_a_rig_file(rig):
     service = rig
     body = {

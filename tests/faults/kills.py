@@ -10,6 +10,7 @@ This proves what the process promises, not what the disk does: the page cache su
 
 import contextlib
 import http.client
+import itertools
 import json
 import math
 import os
@@ -38,18 +39,24 @@ KILLS_A_RECORD = 24
 KILLS_A_SESSION = 4
 POINTS_OF_SCANNER = 24
 QUANTA_PER_MM = 8192  # of the stored truth, stated here once more
+_BREATH_S = 0.1
+"""What a client waits after a refusal."""
 _DEVICE = "KILL-1"
 _SETTINGS = {"max_points": 300_000}
 
 
 @dataclass
 class Account:
-    """What was seen: kills, lines acknowledged in all, lines looked for that were lost, doubled or torn."""
+    """What was seen: kills, lines acknowledged in all, lines looked for that were lost, doubled or torn.
+
+    `pushed_again` are lines that a starved service refused by name, and that the client pushed once more.
+    """
 
     kills: int = 0
     acknowledged: int = 0
     of_scanner: int = 0
     while_starting: int = 0
+    pushed_again: int = 0
     lost: int = 0
     doubled: int = 0
     torn: int = 0
@@ -61,11 +68,16 @@ class Account:
 
 
 @dataclass
-class _Pushed:
-    """A session of pushed lines: the number that the record gave each acknowledged line."""
+class Pushed:
+    """A session of pushed lines: the number that the record gave each acknowledged line; how often one was refused."""
 
     session: str = ""
     acknowledged: dict[int, int] = field(default_factory=dict)
+    refused: int = 0
+
+    def first_missing(self) -> int:
+        """The lowest index that is not acknowledged: a refused line may lie before others that were not."""
+        return next(index for index in itertools.count() if index not in self.acknowledged)
 
 
 @dataclass
@@ -148,6 +160,8 @@ class Client:
         text = answer.read()
         if answer.status in (502, 503):
             raise Refused(text)
+        if answer.status == 409 and "lines" in (told := json.loads(text)):
+            return told  # each line has its outcome
         if answer.status >= 300:
             raise RuntimeError(f"{method} {path}: {answer.status} {text[:300]!r}")
         return json.loads(text) if text else None
@@ -184,17 +198,18 @@ def kill_services(
     try:
         while account.kills < kills or account.acknowledged < lines:
             with tempfile.TemporaryDirectory(prefix="kills-") as folder, _scanner(rng) as scanner:
-                data, pushed = Path(folder) / "data", [_Pushed()]
+                data, pushed = Path(folder) / "data", [Pushed()]
                 scanned: list[_Scanned] = []
                 wanted = max(1, (lines - account.acknowledged) // max(1, kills - account.kills))
                 for number in range(min(KILLS_A_RECORD, max(1, kills - account.kills))):
                     if number % KILLS_A_SESSION == KILLS_A_SESSION - 1:
-                        pushed.append(_Pushed())
-                    before = len(pushed[-1].acknowledged)
+                        pushed.append(Pushed())
+                    before, refused = len(pushed[-1].acknowledged), pushed[-1].refused
                     latest = _one_service(zygote, data, scanner, pushed[-1], rng, wanted, account)
                     account.kills += 1
                     account.acknowledged += len(pushed[-1].acknowledged) - before + latest.lines
                     account.of_scanner += latest.lines
+                    account.pushed_again += pushed[-1].refused - refused
                     scanned.append(latest)
                     _look(data / "record.sqlite", pushed[-1:], scanned[-1:], account)
                     on_progress(account)
@@ -221,7 +236,7 @@ def _one_service(
     zygote: Zygote,
     data: Path,
     scanner: PtyPort,
-    pushed: _Pushed,
+    pushed: Pushed,
     rng: random.Random,
     wanted: int,
     account: Account,
@@ -273,17 +288,17 @@ def _guarded(failures: list[BaseException], work: Callable[[], None]) -> None:
         failures.append(error)
 
 
-def _push(client: Client, pushed: _Pushed, target: int, done: threading.Event, seed: int) -> None:
-    """Push until `target` lines are acknowledged, and then on without waiting for the answer: the kill comes there."""
+def _push(client: Client, pushed: Pushed, target: int, done: threading.Event, seed: int) -> None:
+    """Push until the first `target` lines are acknowledged, and on without waiting: the kill comes there."""
     try:
-        index = _push_until(client, pushed, target, done, seed)
+        index = push_until(client, pushed, target, done, seed)
     except BaseException:
         client.close()
         raise
     threading.Thread(target=_guarded, args=([], lambda: _one_more(client, pushed, index)), daemon=True).start()
 
 
-def _push_until(client: Client, pushed: _Pushed, target: int, done: threading.Event, seed: int) -> int:
+def push_until(client: Client, pushed: Pushed, target: int, done: threading.Event, seed: int) -> int:
     rng = random.Random(seed)
     if not pushed.session:
         made = client.ask(
@@ -291,19 +306,26 @@ def _push_until(client: Client, pushed: _Pushed, target: int, done: threading.Ev
         )
         pushed.session = made["id"]
     client.ask("POST", f"/api/v1/sessions/{pushed.session}/start")
-    index = max(0, len(pushed.acknowledged) - rng.randrange(4))
-    while len(pushed.acknowledged) < target and not done.is_set():
+    index = max(0, pushed.first_missing() - rng.randrange(4))
+    while pushed.first_missing() < target and not done.is_set():
         count = min(rng.randrange(1, 257), max(1, target + 8 - index))
         lines = [pushed_line(line) for line in range(index, index + count)]
         told = client.ask("POST", f"/api/v1/sessions/{pushed.session}/scanlines", {"lines": lines})["lines"]
+        refused = [line["line_index"] for line in told if line["outcome"] == "refused"]
         for line in told:
+            if line["outcome"] == "refused":
+                continue
             known = pushed.acknowledged.setdefault(line["line_index"], line["line_number"])
             assert line["outcome"] in ("stored", "duplicate") and known == line["line_number"], line
         index += count
+        if refused:  # a starved service took none of them: they are pushed again, as any client must
+            pushed.refused += len(refused)
+            index = min(refused)
+            done.wait(_BREATH_S)
     return index
 
 
-def _one_more(client: Client, pushed: _Pushed, index: int) -> None:
+def _one_more(client: Client, pushed: Pushed, index: int) -> None:
     lines = [pushed_line(line) for line in range(index, index + 64)]
     with contextlib.closing(client):
         client.ask("POST", f"/api/v1/sessions/{pushed.session}/scanlines", {"lines": lines})
@@ -338,7 +360,7 @@ def _watch_scan(client: Client, scanner: PtyPort, scanned: _Scanned, done: threa
             )
 
 
-def _look(path: Path, pushed: list[_Pushed], scanned: list[_Scanned], account: Account) -> None:
+def _look(path: Path, pushed: list[Pushed], scanned: list[_Scanned], account: Account) -> None:
     """Read the record that the killed service left, as the next one would find it."""
     if not path.exists():
         assert not any(session.acknowledged for session in pushed) and not any(item.lines for item in scanned)
@@ -364,7 +386,7 @@ def _read(record: Record, session: str, account: Account) -> list[tuple[int, Sto
     return found
 
 
-def _compare_pushed(record: Record, pushed: _Pushed, account: Account) -> None:
+def _compare_pushed(record: Record, pushed: Pushed, account: Account) -> None:
     number_of = {}
     for number, line in _read(record, pushed.session, account):
         number_of[line.line_index] = number

@@ -2,12 +2,14 @@
 
 import logging
 import sqlite3
+import threading
+from collections import Counter
 
 import pytest
 
 from tests.faults import sqlite_disk
 from tests.faults.bit_flips import flip_bits
-from tests.faults.kills import kill_services
+from tests.faults.kills import Pushed, kill_services, push_until
 from tests.faults.power_cuts import cut_power
 from tests.faults.storage_faults import every_fault, inject, sample
 
@@ -60,6 +62,32 @@ def test_the_whole_service_is_killed_during_a_scan_and_loses_nothing():
     account = kill_services(kills=3, lines=600, seed=14)
     assert kept_everything(account), account
     assert account.acknowledged >= 600
+
+
+def test_lines_that_a_starved_service_refuses_are_pushed_again_until_it_takes_them():
+    class Starved:
+        """Refuses every third line the first two times."""
+
+        def __init__(self):
+            self.stored, self.refusals = {}, Counter()
+
+        def ask(self, method, path, body=None):
+            return {"id": "S"} if body is None or "source" in body else {"lines": [*map(self.take, body["lines"])]}
+
+        def take(self, line):
+            index = line["line_index"]
+            if index % 3 == 0 and self.refusals[index] < 2:
+                self.refusals[index] += 1
+                return {"line_index": index, "outcome": "refused", "detail": "the disk is slow"}
+            is_new = index not in self.stored
+            number = self.stored.setdefault(index, len(self.stored))
+            return {"line_index": index, "outcome": "stored" if is_new else "duplicate", "line_number": number}
+
+    service, pushed = Starved(), Pushed()
+    push_until(service, pushed, 40, threading.Event(), seed=1)
+    assert set(range(40)) <= set(pushed.acknowledged)
+    assert pushed.acknowledged == service.stored
+    assert pushed.refused == service.refusals.total() > 20
 
 
 @pytest.mark.long

@@ -7,10 +7,11 @@ from fastapi import APIRouter, Depends, Query, Request
 from starlette.responses import Response
 
 from scanner_service.api.answers import answer
-from scanner_service.api.pass_schemas import CarryOutIn, LoopIn, ReasonName, RegionId, RigIn, serving_of
+from scanner_service.api.pass_schemas import AcceptIn, CarryOutIn, LoopIn, ReasonName, RegionId, RigIn, serving_of
 from scanner_service.api.routes.sessions import Session, book_of, operator, viewer
 from scanner_service.rescan.passes.serving import Serving
 from scanner_service.sessions.pass_desk import PassDesk
+from scanner_service.sessions.pass_planning import name_of
 
 router = APIRouter(prefix="/api/v1/sessions/{session_id}", tags=["passes"])
 
@@ -44,13 +45,17 @@ def state_rig(desk: Desk, body: RigIn) -> Response:
 @router.get("/recommended-passes", dependencies=[viewer])
 def list_passes(desk: Desk, serving: Served) -> Response:
     """The recommended passes for the map as it is, the best for its time first, and what none of them can bring."""
-    return answer(desk.plan(serving).to_dict())
+    plan = desk.plan(serving)
+    return answer({"plan": name_of(plan)} | plan.to_dict())
 
 
 @router.post("/recommended-passes/{number}/accept", status_code=201, dependencies=[operator])
-def accept_pass(desk: Desk, number: int, serving: Served) -> Response:
-    """Take an order for a pass of the latest plan for the same regions and reasons. Nothing moves by that."""
-    return answer(desk.accept(number, serving).to_dict(), 201)
+def accept_pass(desk: Desk, number: int, serving: Served, body: AcceptIn = AcceptIn()) -> Response:  # noqa: B008
+    """Take an order for a pass of the plan that was listed for the same regions and reasons. Nothing moves by that.
+
+    The status is 409 when that plan is no longer in force: the number may then mean another pass.
+    """
+    return answer(desk.accept(number, serving, body.seen()).to_dict(), 201)
 
 
 @router.get("/pass-orders", dependencies=[viewer])
@@ -71,14 +76,15 @@ def carry_out(desk: Desk, order: int, body: CarryOutIn = CarryOutIn()) -> Respon
 
     It may come without a body: then the part is not turned.
 
-    An order that is refused is cancelled, with the reason as its message.
+    An order that is refused is cancelled, and one whose devices do not set off has failed, with the reason as its
+    message.
     """
     return answer(desk.carry_out(order, body.part_is_turned).to_dict())
 
 
 @router.delete("/pass-orders/{order}", dependencies=[operator])
 def cancel_order(desk: Desk, order: int) -> Response:
-    """Give up an accepted pass that was not carried out; it stays in the list, as cancelled."""
+    """Give up an accepted pass that was not carried out, at once; it stays in the list, as cancelled."""
     return answer(desk.cancel(order).to_dict())
 
 

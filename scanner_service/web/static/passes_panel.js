@@ -99,7 +99,7 @@ export class PassesPanel {
     if (plan !== null) {
       byId("passes-count").textContent = String(plan.passes.length);
       const none = element("li.empty", {}, "Nothing that this rig reaches would be a gain.");
-      byId("passes").replaceChildren(...(plan.passes.length ? plan.passes.map((one) => this.#pass(one)) : [none]));
+      byId("passes").replaceChildren(...(plan.passes.length ? plan.passes.map((one) => this.#pass(one, plan.plan)) : [none]));
       this.onPass(null);
     }
     byId("orders").replaceChildren(...orders.toReversed().map((order) => this.#order(order)));
@@ -109,7 +109,7 @@ export class PassesPanel {
     byId("loop-note").textContent = loop === null ? "" : loop.running ? `Closed loop: pass ${loop.passes} of at most ${loop.max_passes}` : `The loop ended: ${loop.why_ended}.`;
   }
 
-  #pass(one) {
+  #pass(one, plan) {
     const pointed = { onmouseenter: () => this.onPass(one), onmouseleave: () => this.onPass(null), onfocusin: () => this.onPass(one), onfocusout: () => this.onPass(null) };
     return element(
       "li.pass",
@@ -119,7 +119,7 @@ export class PassesPanel {
       element("span", {}, `for ${served(one) || "nothing"}`),
       one.explores_mm2 > 0.5 * one.gain_mm2 ? element("span", {}, "Explores: most of it may not be there.") : null,
       one.turn_part ? element("span", {}, `First: ${one.turn_part}.`) : null,
-      element("button", { type: "button", onclick: () => this.#act(() => acceptPass(this.#id, one.number)) }, "Accept"),
+      element("button", { type: "button", onclick: () => this.#act(() => acceptPass(this.#id, one.number, plan)) }, "Accept"),
     );
   }
 

@@ -67,7 +67,8 @@ export const askFor = (id, requirement) => send(sessionPath(id, "requirement"), 
 // Measure coverage against a mesh in the service's folder, or against the surface seen when `file` is null.
 export const measureAgainst = (id, file, units) => (file === null ? answer(sessionPath(id, "reference"), { method: "DELETE" }) : send(sessionPath(id, "reference"), { file, units }, "PUT"));
 
-export const acceptPass = (id, number) => answer(sessionPath(id, `recommended-passes/${number}/accept`), { method: "POST" });
+// `plan` is the one in which the pass is shown: refused when another is in force.
+export const acceptPass = (id, number, plan) => send(sessionPath(id, `recommended-passes/${number}/accept`), { plan });
 
 export const cancelOrder = (id, order) => answer(sessionPath(id, `pass-orders/${order}`), { method: "DELETE" });
 

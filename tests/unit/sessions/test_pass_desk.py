@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.rig_limits import AxisKind
+from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.errors import RigUnlimited
 from scanner_service.rescan.passes.needs import FIRST_CHANCES
 from scanner_service.rescan.passes.outcome import Outcome
@@ -20,8 +21,9 @@ from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions import pass_planning
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.closed_loop import LoopLimits
-from scanner_service.sessions.errors import PassUnknown, SessionBusy
+from scanner_service.sessions.errors import PassUnknown, PlanOvertaken, SessionBusy
 from scanner_service.sessions.pass_orders import PassStatus
+from scanner_service.sessions.pass_planning import name_of
 from scanner_service.sessions.references import Nominal
 from scanner_service.sessions.rig_setups import RigSetup
 from scanner_service.sessions.settings import SessionSettings
@@ -66,11 +68,10 @@ def kinds(book, session):
 
 def told(book, session, kind):
     """How often the record tells of a kind of event; its writer is given time."""
-    for _ in range(600):
-        if kind in kinds(book, session):
-            break
+    deadline_s = time.monotonic() + 300.0
+    while kind not in (found := kinds(book, session)) and time.monotonic() < deadline_s:
         time.sleep(0.05)
-    return kinds(book, session).count(kind)
+    return found.count(kind)
 
 
 def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
@@ -127,6 +128,91 @@ def test_orders_are_answered_while_a_plan_is_made(book, scanned, monkeypatch):
     planner.join(300)
     assert waited == [True]  # the plan was still being made when all of these were answered
     assert plans[0].passes
+
+
+def test_a_pass_is_accepted_of_the_plan_that_was_seen_or_not_at_all(book, scanned):
+    session, _ = scanned
+    desk = book.pass_desk(session)
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
+    seen = desk.plan()
+    assert desk.accept(2, seen=name_of(seen)).planned.to_dict() == seen.passes[1].to_dict()
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))  # planned anew, with the same result: what was seen holds
+    assert desk.accept(2, seen=name_of(seen)).planned.to_dict() == seen.passes[1].to_dict()
+    desk.describe_rig(RigSetup(linear_reach(), OPTICS))
+    with pytest.raises(PlanOvertaken, match=r"no longer in force.*list the passes again"):
+        desk.accept(1, seen=name_of(seen))
+    with pytest.raises(PlanOvertaken):
+        desk.accept(1, Serving(reasons=frozenset({Reason.SPARSE})), name_of(seen))
+    assert len(desk.orders()) == 2
+
+
+def test_whoever_accepts_while_rigs_change_gets_what_was_seen_or_a_refusal(book, scanned):
+    session, _ = scanned
+    desk = book.pass_desk(session)
+    setups = [RigSetup(reach, OPTICS) for reach in (free_reach(30.0), linear_reach())]
+    seen = []
+    for setup in setups:
+        desk.describe_rig(setup)
+        seen.append(desk.plan())
+    assert seen[0].passes[0].to_dict() != seen[1].passes[0].to_dict()
+    taken, refused, others = [], [], []
+
+    def accept(plan):
+        for _ in range(2):
+            try:
+                taken.append((plan, desk.accept(1, seen=name_of(plan))))
+            except PlanOvertaken:
+                refused.append(plan)
+            except Exception as error:  # noqa: BLE001 - told by the thread that waits
+                others.append(error)
+            desk.describe_rig(setups[len(taken) % 2])
+
+    threads = [threading.Thread(target=accept, args=(seen[k % 2],)) for k in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not others and len(taken) + len(refused) == 6
+    for plan, order in taken:
+        assert order.planned.to_dict() == plan.passes[0].to_dict()
+    assert [order.order_id for order in desk.orders()] == list(range(1, len(taken) + 1))
+    for setup, plan in zip(setups, seen, strict=True):
+        desk.describe_rig(setup)
+        assert desk.accept(1, seen=name_of(plan)).planned.to_dict() == plan.passes[0].to_dict()
+
+
+def test_orders_are_cancelled_at_once_while_another_is_being_set_off(book, scanned, monkeypatch):
+    session, _ = scanned
+    desk = book.pass_desk(session)
+    desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
+    first, second, third = (desk.accept(1) for _ in range(3))
+    begun, may_go, waited = threading.Event(), threading.Event(), []
+    fresh_results = session.fresh_results
+
+    def slow_verdict():
+        if threading.current_thread() is setter:
+            begun.set()
+            waited.append(may_go.wait(300))
+        return fresh_results()
+
+    monkeypatch.setattr(session, "fresh_results", slow_verdict)
+    setter = threading.Thread(target=desk.carry_out, args=(first.order_id,))
+    setter.start()
+    assert begun.wait(300)
+    assert desk.cancel(second.order_id).status is PassStatus.CANCELLED
+    with pytest.raises(SessionBusy, match="just being set off"):
+        desk.cancel(first.order_id)
+    with pytest.raises(SessionBusy, match="being set off"):
+        desk.carry_out(first.order_id)
+    with pytest.raises(SessionBusy, match="pass order 1 is being carried out"):
+        desk.carry_out(third.order_id)
+    assert (first.status, third.status) == (PassStatus.ACCEPTED, PassStatus.CANCELLED)
+    may_go.set()
+    setter.join(300)
+    assert waited == [True]  # all of these were answered while the first was being set off
+    assert first.status is PassStatus.RUNNING
+    session.stop()
+    desk.wait_for(first)
 
 
 def test_a_plan_that_is_overtaken_by_another_rig_is_made_again(book, scanned, monkeypatch):
