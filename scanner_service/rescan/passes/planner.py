@@ -11,17 +11,10 @@ from scanner_service.rescan.passes.cover import Choice, Cover
 from scanner_service.rescan.passes.gain import MARGIN, SERVED, Prospect, prospect_of
 from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.looks import Look
-from scanner_service.rescan.passes.needs import (
-    FIRST_CHANCES,
-    UNSEEN,
-    Chances,
-    Needs,
-    Wanted,
-    failing_points,
-    find_needs,
-)
+from scanner_service.rescan.passes.needs import UNSEEN, Needs, Wanted, failing_points, find_needs
 from scanner_service.rescan.passes.nominal import missing_of
 from scanner_service.rescan.passes.optics import ScannerOptics
+from scanner_service.rescan.passes.promises import NO_EXPERIENCE, Experience
 from scanner_service.rescan.passes.reach import Reach
 from scanner_service.rescan.passes.recommendation import Plan, Promise, RecommendedPass
 from scanner_service.rescan.passes.serving import EVERYTHING, Serving
@@ -47,15 +40,15 @@ class Wishes:
 
     `requirement` asks for more than a density: line spacing, chord error, incidence. `serving` names what is to be
     served; unseen surface only when nothing is named. `explore` reckons with surface where hidden space begins,
-    outside of any region. `chances` are how much good surface each kind of evidence has proved to bring
-    (`experience.chances_of`).
+    outside of any region. `learned` is how much good surface each kind of evidence has proved to bring
+    (`experience.experience_of`).
     """
 
     density_per_mm2: float
     max_passes: int = 6
     least_gain_mm2: float = 1.0
     explore: bool = True
-    chances: Chances = FIRST_CHANCES
+    learned: Experience = NO_EXPERIENCE
     cell_mm: float | None = None
     requirement: Requirement | None = None
     serving: Serving = EVERYTHING
@@ -92,7 +85,7 @@ def plan_passes(
     missing = None if reference is None else missing_of(reference, regions)
     wanted = Wanted.of(wishes.density_per_mm2, wishes.requirement)
     explore = wishes.explore and wishes.serving.is_everything
-    needs = find_needs(snapshot, report, surface, wanted, wishes.chances, explore, regions, missing)
+    needs = find_needs(snapshot, report, surface, wanted, wishes.learned.chances, explore, regions, missing)
     if not wishes.serving.is_everything:
         named = [one.number for one in regions if wishes.serving.wants(one)]
         needs = needs.only(np.isin(needs.region, named))
@@ -177,6 +170,7 @@ def _recommend(
         place_area_mm2=kept.area_mm2,
         place_evidence=kept.evidence.astype(np.float64),
         place_normals=kept.normals,
+        place_tried=kept.tried,
         turn=choice.attitude.turn,
-        chances=wishes.chances,
+        learned=wishes.learned,
     )
