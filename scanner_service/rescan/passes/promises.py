@@ -21,7 +21,8 @@ _IN_VAIN = 1.0  # so much less sure is a place that a pass was in vain for
 EIGHTY_PERCENT = 1.2816
 """Standard deviations to either side within which a normal variable lies four times in five."""
 PROMISED_WITHIN = 0.5
-"""What is promised comes four times in five within this share of it; what would widen that is explored."""
+"""What is promised comes four times in five within this share of it; what would widen that is explored, and so is a
+kind that varies by more than this itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +56,7 @@ class _Lot:
     """The places of a pass of one kind, those that a pass was in vain for apart."""
 
     mine: BoolArray
+    may_be_promised: bool
     mm2: float
     most_mm2: float
     deviation_mm2: float
@@ -65,8 +67,8 @@ def promised_places(
 ) -> BoolArray:
     """(k,) which places a pass promises; the others it explores.
 
-    Kinds are promised from the surest on, as long as the interval of all that is promised stays within
-    `PROMISED_WITHIN` of it. What a pass was in vain for is never promised.
+    Kinds that vary by less than `PROMISED_WITHIN` are promised from the surest on, as long as the interval of all that
+    is promised stays within that, too. What a pass was in vain for is never promised.
 
     Parameters
     ----------
@@ -74,7 +76,7 @@ def promised_places(
     evidence : why each is believed in (`Evidence`).
     tried : where passes were in vain.
     """
-    lots = [lot for lot in _lots(mm2, area_mm2, evidence, tried, learned) if not tried[lot.mine].any()]
+    lots = [lot for lot in _lots(mm2, area_mm2, evidence, tried, learned) if lot.may_be_promised]
     lots.sort(key=lambda lot: lot.deviation_mm2 / lot.mm2)
     promised = np.zeros(len(mm2), dtype=np.bool_)
     total, variance = 0.0, 0.0
@@ -92,7 +94,8 @@ def expectation_of(
 ) -> Expectation:
     """What places bring together; arguments as those of `promised_places`.
 
-    Kinds vary for themselves, so that their squares add up. Surface whose place is known cannot be more than its area.
+    Each place is there or not, and each kind as a whole brings more or less than was foretold, for itself: squares add
+    up. Surface whose place is known cannot be more than its area.
     """
     low, high = 0.0, 0.0
     for lot in _lots(mm2, area_mm2, evidence, tried, learned):
@@ -113,8 +116,11 @@ def _lots(
             total = float(mm2[mine].sum())
             if total <= 0.0:
                 continue
-            asked = total / learned.chances[kind]
-            share = math.sqrt(learned.spreads[kind] ** 2 + GRAINS_MM2[kind] / asked) + (_IN_VAIN if in_vain else 0.0)
-            most = math.inf if kind in HIDDEN_KINDS else max(total, float(area_mm2[mine].sum()))
-            found.append(_Lot(mine, total, most, share * total))
+            area, spread = area_mm2[mine], learned.spreads[kind]
+            there = np.minimum(mm2[mine] / area, 1.0)
+            share = math.sqrt(spread**2 + GRAINS_MM2[kind] * learned.chances[kind] / total)
+            share += _IN_VAIN if in_vain else 0.0
+            deviation = math.hypot(share * total, math.sqrt(float((area**2 * there * (1.0 - there)).sum())))
+            most = math.inf if kind in HIDDEN_KINDS else max(total, float(area.sum()))
+            found.append(_Lot(mine, not in_vain and spread <= PROMISED_WITHIN, total, most, deviation))
     return found

@@ -54,12 +54,14 @@ def test_the_surer_kinds_are_promised_first_and_more_of_them_makes_a_promise_no_
     promised = promised_places(*places, NO_EXPERIENCE)
 
     def share(one):
-        asked = mm2[(kind == one) & ~tried].sum() / FIRST_CHANCES[one]
-        return np.hypot(FIRST_SPREADS[one], np.sqrt(GRAINS_MM2[one] / asked))
+        mine = (kind == one) & ~tried
+        told = expectation_of(*(column[mine] for column in places), NO_EXPERIENCE)
+        return (told.mm2 - told.low_mm2) / told.mm2
 
     present = [one for one in Evidence if ((kind == one) & ~tried).any()]
     told = [one for one in present if promised[(kind == one) & ~tried].any()]
-    left = [one for one in present if one not in told]
+    left = [one for one in present if one not in told and FIRST_SPREADS[one] <= PROMISED_WITHIN]
+    assert all(FIRST_SPREADS[one] <= PROMISED_WITHIN for one in told)  # such a kind is explored, however sure the rest
     assert all(promised[(kind == one) & ~tried].all() for one in told)  # a kind as a whole, or not
     assert max(map(share, told), default=0.0) <= min(map(share, left), default=np.inf)
     more = np.append(mm2, 50.0), np.append(area, 50.0), np.append(kind, float(Evidence.MEASURED)), np.append(tried, 0)
@@ -76,6 +78,13 @@ def test_a_few_square_millimetres_of_hidden_space_are_explored_and_many_are_prom
     assert is_promised(Evidence.MEASURED, 1.0) and is_promised(Evidence.FRONTIER, 100.0)
     assert not is_promised(Evidence.FRONTIER, 3.0) and not is_promised(Evidence.REST, 1000.0)
     assert not is_promised(Evidence.MEASURED, 100.0, tried=True)
+    assert not promised_places(np.array([500.0, 50.0]), np.array([500.0, 50.0]), np.array([0.0, 6.0]),
+                               np.zeros(2, dtype=bool), NO_EXPERIENCE)[1]  # fmt: skip
+    floor = np.full(2, float(Evidence.FLOOR)), np.zeros(2, dtype=bool)
+    one_place = np.array([25.0, 0.0]), np.array([100.0, 1.0]), *floor  # it is there or not
+    assert not promised_places(*one_place, NO_EXPERIENCE).any()
+    many = tuple(np.repeat(column, 50) for column in (np.ones(2), np.full(2, 4.0), *floor))
+    assert promised_places(*many, NO_EXPERIENCE).all()
     sure = Experience(spreads=(0.1,) * len(Evidence))  # on this part rests prove as foretold
     assert is_promised(Evidence.REST, 1000.0, sure)
     nothing = np.zeros(0)
