@@ -1,6 +1,7 @@
 """What of a pass may be promised: laws of its sums and intervals, and how often outcomes drawn by chance keep them."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -158,3 +159,11 @@ def test_a_kind_that_brings_now_much_now_nothing_is_believed_in_less_surely_than
     assert spread(*[1.0] * 12) < spread(1.0, 1.0) < first
     assert spread(0.0, asked_mm2=0.3) == pytest.approx(first, rel=0.05)  # a piece was not there: that was foretold
     assert dataclasses.astuple(experience_of([became(0.0, 0.0)])) == dataclasses.astuple(NO_EXPERIENCE)
+
+
+def test_the_page_says_with_what_numbers_a_session_begins():
+    page = (Path(__file__).resolve().parents[4] / "docs" / "passes.md").read_text(encoding="utf-8")
+    for kind in Evidence:
+        row = next(line for line in page.splitlines() if line.startswith(f"| `{kind.name.lower()}`:"))
+        told = [float(column.split()[0]) for column in row.strip("| ").split("|")[1:]]
+        assert told == pytest.approx([FIRST_CHANCES[kind], 100.0 * FIRST_SPREADS[kind], GRAINS_MM2[kind]])
