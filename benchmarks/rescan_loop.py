@@ -22,7 +22,7 @@ from benchmarks.rescan_scan import (
 )
 from drivers.scanline import Float64Array, Pose
 from scanner_service.analysis.snapshot import MapSnapshot
-from scanner_service.rescan.passes.experience import chances_of
+from scanner_service.rescan.passes.experience import experience_of
 from scanner_service.rescan.passes.looks import look_of
 from scanner_service.rescan.passes.optics import ScannerOptics
 from scanner_service.rescan.passes.outcome import Outcome, reckon
@@ -148,7 +148,7 @@ def closed_loop(
     snapshot, report = judged(scan, scanner)
     plan: Plan | None = None
     for _ in range(MAX_PASSES):
-        wishes = Wishes(DENSITY_PER_MM2, max_passes=1, chances=chances_of(earlier))
+        wishes = Wishes(DENSITY_PER_MM2, max_passes=1, learned=experience_of(earlier))
         begun = time.perf_counter()
         looks = [look_of(snapshot, n, *one, scanner.points_per_line) for n, one in enumerate(scan.looks)]
         seen = tuple(look for look in looks if look is not None)

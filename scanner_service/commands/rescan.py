@@ -111,9 +111,11 @@ def _said(order: dict[str, Any]) -> str:
     head = f"{one['start_mm']:.1f} to {one['end_mm']:.1f} mm, lines {one['line_spacing_mm']:.3f} mm apart"
     told = [order["status"]]
     if (outcome := order["outcome"]) is not None:
-        told.append(f"promised {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²")
+        promised = _area(outcome["promised_mm2"], outcome["promised_between_mm2"])
+        told.append(f"promised {promised}, reached {outcome['reached_mm2']:.0f} mm²")
         if outcome["expected_mm2"] >= 1.0:
-            told.append(f"explored: {outcome['found_mm2']:.0f} mm² found of {outcome['expected_mm2']:.0f} mm² expected")
+            expected = _area(outcome["expected_mm2"], outcome["expected_between_mm2"])
+            told.append(f"explored: {outcome['found_mm2']:.0f} mm² found, {expected} expected")
         if outcome["doubt"]:
             told.append(f"warning: {outcome['doubt']}")
     if order["status"] == "done" and order["reached_end"] is False:
@@ -121,6 +123,11 @@ def _said(order: dict[str, Any]) -> str:
     if order["message"]:
         told.append(order["message"])
     return f"{head}: {'; '.join(told)}"
+
+
+def _area(mm2: float, between_mm2: list[float] | None) -> str:
+    """An area as it was foretold, with the interval in which it lies four times in five: "12 mm² (8 to 15)"."""
+    return f"{mm2:.0f} mm²" + ("" if between_mm2 is None else f" ({between_mm2[0]:.0f} to {between_mm2[1]:.0f})")
 
 
 def _tell_plan(plan: dict[str, Any]) -> None:
@@ -140,7 +147,7 @@ def _tell_plan(plan: dict[str, Any]) -> None:
         console.print("No pass is recommended.")
     for one in plan["passes"]:
         first = f"; first {one['turn_part']} (then say --turned)" if one["turn_part"] else ""
-        said = f"pass {one['number']} serves {_served(one)}{first}"
+        said = f"pass {one['number']} serves {_served(one)}: {_foretold(one)}{first}"
         console.print(said, highlight=False, soft_wrap=True)
     for lost in plan["unreachable"]:
         what = "surface outside of any region" if lost["region"] is None else f"region {lost['region']}"
@@ -154,9 +161,15 @@ def _served(one: dict[str, Any]) -> str:
     named = [str(item["region"]) for item in one["serves"] if item["region"] is not None]
     regions = f"region{'s' if len(named) > 1 else ''} {', '.join(named)}" if named else ""
     unseen = "unseen surface" if len(named) < len(one["serves"]) else ""
-    explores = one["explores_mm2"] > 0.5 * one["gain_mm2"]
-    served = " and ".join(filter(None, (regions, unseen))) or "nothing"
-    return f"{served} (explores: most of what is expected may not be there)" if explores else served
+    return " and ".join(filter(None, (regions, unseen))) or "nothing"
+
+
+def _foretold(one: dict[str, Any]) -> str:
+    """What a pass promises, and what it explores, each with its interval."""
+    promised = f"promises {_area(one['promised_mm2'], one['promised_between_mm2'])}"
+    explored = f"explores, and expects {_area(one['explores_mm2'], one['explores_between_mm2'])}"
+    told = [promised] if one["promised_mm2"] >= 0.5 else []
+    return ", ".join([*told, explored] if one["explores_mm2"] >= 0.5 or not told else told)
 
 
 def _tell_orders(orders: list[dict[str, Any]]) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.scanline import Pose
-from scanner_service.rescan.passes.experience import chances_of
+from scanner_service.rescan.passes.experience import experience_of
 from scanner_service.rescan.passes.looks import Look, look_of
 from scanner_service.rescan.passes.motion import Motion, StraightMotion
 from scanner_service.rescan.passes.outcome import Outcome
@@ -56,7 +56,7 @@ class PlanQuestion:
             required = float(np.nanmedian(results.report.judgement.required_per_mm2)) if len(results.snapshot) else 1.0
         wishes = Wishes(
             required,
-            chances=chances_of(self.earlier),
+            learned=experience_of(self.earlier),
             requirement=results.requirement,
             serving=self.serving,
         )

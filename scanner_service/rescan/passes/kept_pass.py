@@ -2,7 +2,7 @@
 
 import base64
 import binascii
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,13 @@ import numpy as np
 from drivers.scanline import Float64Array, Pose
 from scanner_service.rescan.passes.motion import Motion, StraightMotion, TurningMotion
 from scanner_service.rescan.passes.needs import FIRST_CHANCES, Evidence
+from scanner_service.rescan.passes.promises import FIRST_SPREADS, Experience
 from scanner_service.rescan.passes.reach import PartTurn
 from scanner_service.rescan.passes.recommendation import Promise, RecommendedPass, pose_dict
 
-_COLUMNS = 10  # a place (3), where it faces (3), what is promised of it, its area, its region, its evidence
+_COLUMNS = 11  # a place (3), where it faces (3), what is expected of it, its area, its region, its evidence, tried
+_FORMER_COLUMNS = 10  # without the last
+_FORMER_TRIED = 0.45  # then places of which less than this was left of what their kind brings passed for tried
 _MOST_PLACES = 20_000
 
 
@@ -22,6 +25,7 @@ def keep_pass(one: RecommendedPass) -> dict[str, Any]:
     rows = np.column_stack(
         [
             one.places_mm, one.place_normals, one.place_mm2, one.place_area_mm2, one.place_regions, one.place_evidence,
+            one.place_tried,
         ]
     )  # fmt: skip
     return {
@@ -37,9 +41,11 @@ def keep_pass(one: RecommendedPass) -> dict[str, Any]:
             [each.region, each.gain_mm2, each.density_per_mm2, each.incidence_rad, each.largest_incidence_rad]
             for each in one.promises
         ],
+        "columns": _COLUMNS,
         "places": base64.b64encode(rows.astype("<f4").tobytes()).decode("ascii"),
         "turn": None if one.turn is None else [one.turn.about_vertical_rad, one.turn.tip_rad],
-        "chances": list(one.chances),
+        "chances": list(one.learned.chances),
+        "spreads": list(one.learned.spreads),
     }
 
 
@@ -54,33 +60,47 @@ def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
         raw = base64.b64decode(kept["places"], validate=True)
     except binascii.Error as error:
         raise ValueError(f"the places of a kept pass cannot be read: {error}") from None
-    if len(raw) % (4 * _COLUMNS) or len(raw) > 4 * _COLUMNS * _MOST_PLACES:
-        raise ValueError(f"the places of a kept pass have {len(raw)} bytes, which are no rows of {_COLUMNS} numbers")
-    rows = np.frombuffer(raw, dtype="<f4").reshape(-1, _COLUMNS).astype(np.float64)
+    columns = int(kept.get("columns", _FORMER_COLUMNS))
+    if columns not in (_COLUMNS, _FORMER_COLUMNS):
+        raise ValueError(f"the places of a kept pass are told in {columns} numbers each, which nobody knows to read")
+    if len(raw) % (4 * columns) or len(raw) > 4 * columns * _MOST_PLACES:
+        raise ValueError(f"the places of a kept pass have {len(raw)} bytes, which are no rows of {columns} numbers")
+    rows = np.frombuffer(raw, dtype="<f4").reshape(-1, columns).astype(np.float64)
     numbers = {
         name: float(kept[name])
         for name in (
             "start_mm", "end_mm", "line_spacing_mm", "line_rate_hz", "duration_s", "approach_s",
         )
     }  # fmt: skip
-    turn, chances = kept["turn"], tuple(map(float, kept["chances"]))
-    if len(chances) > len(Evidence):
-        raise ValueError(f"a kept pass has {len(chances)} chances, and there are {len(Evidence)} kinds of evidence")
-    chances += FIRST_CHANCES[len(chances) :]  # of a time when fewer kinds were told apart
+    turn = kept["turn"]
+    chances = _by_kind(kept["chances"], FIRST_CHANCES)
+    learned = Experience(chances, _by_kind(kept.get("spreads", ()), FIRST_SPREADS))
+    mm2, area_mm2, evidence = rows[:, 6].copy(), rows[:, 7].copy(), rows[:, 9].copy()
+    if not np.isin(evidence, list(Evidence)).all():
+        raise ValueError("a kept pass has places of a kind of evidence that nobody knows")
+    former = mm2 <= _FORMER_TRIED * area_mm2 * np.array(chances)[evidence.astype(np.int64)]
     return RecommendedPass(
         number=int(kept["number"]),
         motion=kept_motion(kept["motion"]),
         promises=tuple(Promise(int(region), *map(float, told)) for region, *told in kept["promises"]),
         places_mm=rows[:, :3].copy(),
         place_normals=rows[:, 3:6].copy(),
-        place_mm2=rows[:, 6].copy(),
-        place_area_mm2=rows[:, 7].copy(),
+        place_mm2=mm2,
+        place_area_mm2=area_mm2,
         place_regions=rows[:, 8].copy(),
-        place_evidence=rows[:, 9].copy(),
+        place_evidence=evidence,
+        place_tried=rows[:, 10] > 0 if columns == _COLUMNS else former,
         turn=None if turn is None else PartTurn(float(turn[0]), float(turn[1])),
-        chances=chances,
+        learned=learned,
         **numbers,
     )
+
+
+def _by_kind(kept: Sequence[Any], first: tuple[float, ...]) -> tuple[float, ...]:
+    """A number for each kind of evidence; of a time when fewer kinds were told apart the first ones stand in."""
+    if len(kept) > len(Evidence):
+        raise ValueError(f"a kept pass tells of {len(kept)} kinds of evidence, and there are {len(Evidence)}")
+    return (*map(float, kept), *first[len(kept) :])
 
 
 def keep_motion(motion: Motion) -> dict[str, Any]:

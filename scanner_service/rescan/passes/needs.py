@@ -28,10 +28,10 @@ _BARE = 0.25  # a region is rarely a square around its middle
 _FAR_MM = 4.0  # further than this from known surface hidden space is an empty shadow more often
 _BESIDE = 1.3  # so much more is found beside known surface than there
 _EMPTIED = 0.05  # share of emptied cells around from which on hidden space is a rest
-_SURE = 0.6  # share of solid cells around from which on a rest is taken to begin with surface ...
+_SURE = 0.6  # share of solid cells around from which on hidden space is taken to begin with surface ...
 _RARE = 0.4  # ... and up to which it rarely does: an edge of a shadow, or a thin rest
 _LEAST_SURE = 0.2
-_BESIDE_MM = 2.5  # a rest this far from known surface is half as likely as one that touches it
+_REST_MM = 6.0  # a rest this far from known surface is half as likely as one that touches it
 _ANOTHER = 0.7  # a noisy place is looked at from at most this share of the angle at which it was noisy
 _HEAD_ON_RAD = math.radians(20.0)  # ... and nearer to the normal than this no direction is better
 _OUTNUMBER = 1.25
@@ -54,12 +54,9 @@ class Evidence(IntEnum):
 HIDDEN_KINDS = (Evidence.FRONTIER, Evidence.BEYOND, Evidence.FAR, Evidence.REST)
 """Hidden space is taken to begin with surface."""
 
-FIRM_KINDS = (Evidence.MEASURED, Evidence.FLOOR, Evidence.REFERENCE, Evidence.FRONTIER)
-"""What proved true about as far as it was counted on, on parts of many kinds; the rest is explored."""
-
 Chances = tuple[float, ...]
 """Good surface for each mm² that is believed in, by `Evidence`; of hidden space before edges are counted for less."""
-FIRST_CHANCES: Chances = (1.0, 0.75, 1.1, 0.9, 1.0, 0.8, 1.0)
+FIRST_CHANCES: Chances = (1.0, 0.75, 1.2, 0.9, 1.0, 1.0, 1.5)
 """... before a pass has shown it."""
 
 
@@ -68,8 +65,9 @@ class Needs:
     """Places (n, 3) to be scanned, part frame, with unit normals (n, 3) and the area (n,) each stands for.
 
     `region` (n,) is the number of the region they belong to (UNSEEN: none), `evidence` (n,) why they are believed in,
-    `chance` (n,) how likely they are what they seem. What a pass must bring there: `density_per_mm2` (n,), lines at
-    most `spacing_mm` (n,) apart on the surface, and rays at most `incidence_rad` (n,) from the normal.
+    `chance` (n,) how likely they are what they seem, `tried` (n,) where passes were in vain. What a pass must bring
+    there: `density_per_mm2` (n,), lines at most `spacing_mm` (n,) apart on the surface, and rays at most
+    `incidence_rad` (n,) from the normal.
     """
 
     places_mm: Float64Array
@@ -81,6 +79,7 @@ class Needs:
     chance: Float64Array
     spacing_mm: Float64Array
     incidence_rad: Float64Array
+    tried: BoolArray
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -104,7 +103,8 @@ class Needs:
         none = np.zeros(n, dtype=np.int64)
         density, chance = np.full(n, density_per_mm2), np.ones(n)
         far, wide = np.full(n, np.inf), np.full(n, 0.5 * np.pi)
-        return cls(places_mm, normals, area_mm2, none, none.copy(), density, chance, far, wide)
+        fresh = np.zeros(n, dtype=np.bool_)
+        return cls(places_mm, normals, area_mm2, none, none.copy(), density, chance, far, wide, fresh)
 
     def changed(self, **columns: npt.NDArray[Any]) -> "Needs":
         """With other values in some columns."""
@@ -191,7 +191,7 @@ def find_needs(
     chance = np.array(chances)[evidence] * sure
     needs = Needs(
         places, normals, area, region, evidence, np.full(n, wanted.density_per_mm2), chance,
-        np.full(n, wanted.line_spacing_mm), np.full(n, wanted.incidence_rad),
+        np.full(n, wanted.line_spacing_mm), np.full(n, wanted.incidence_rad), np.zeros(n, dtype=np.bool_),
     )  # fmt: skip
     return _as_judged(snapshot, report, surface, needs, wanted)
 
@@ -249,23 +249,23 @@ def _floors(
 def _frontier(surface: KnownSurface) -> Columns:
     """Where hidden space begins; it belongs to no region.
 
-    What is left of it where passes looked in vain is rarely surface at its edges, where it is thin, and away from known
-    surface.
+    Where it is thin, and at its edges, it is rarely surface, but for what lies beside known surface.
     """
     n = len(surface.frontier_mm2)
     sure = 1.0 / np.maximum(np.abs(surface.frontier_normals).sum(axis=1), 1.0)  # edges of it face askew
     kind = np.full(n, Evidence.FRONTIER, dtype=np.int64)
     if len(surface.points_mm):
         away = np.asarray(cKDTree(surface.points_mm).query(surface.frontier_mm)[0])
-        sure *= _BESIDE - (_BESIDE - 1.0) * np.minimum(away / _FAR_MM, 1.0)
         kind[away > _FAR_MM] = Evidence.FAR
         low, high = surface.points_mm.min(axis=0), surface.points_mm.max(axis=0)
         off = np.maximum(low - surface.frontier_mm, surface.frontier_mm - high).max(axis=1)
         kind[off > 0.5 * surface.cell_mm] = Evidence.BEYOND
-        rest = surface.frontier_emptied > _EMPTIED
-        kind[rest] = Evidence.REST
-        solid = (surface.frontier_solid[rest] - _RARE) / (_SURE - _RARE)
-        sure[rest] *= np.clip(solid, _LEAST_SURE, 1.0) / (1.0 + (away[rest] / _BESIDE_MM) ** 2)
+        kind[surface.frontier_emptied > _EMPTIED] = Evidence.REST
+        beside, rest = kind == Evidence.FRONTIER, kind == Evidence.REST
+        sure[beside] *= _BESIDE - (_BESIDE - 1.0) * np.minimum(away[beside] / _FAR_MM, 1.0)
+        solid = (surface.frontier_solid[~beside] - _RARE) / (_SURE - _RARE)
+        sure[~beside] *= np.clip(solid, _LEAST_SURE, 1.0)
+        sure[rest] /= 1.0 + (away[rest] / _REST_MM) ** 2
     none = np.full(n, UNSEEN, dtype=np.int64)
     return surface.frontier_mm, surface.frontier_normals, surface.frontier_mm2, none, kind, sure
 

@@ -25,6 +25,9 @@ _NOBODY = -1
 _NEVER_MM = 1e30
 
 
+Interval = tuple[float, float]
+
+
 @dataclass(frozen=True, slots=True)
 class RegionOutcome:
     """Promised and reached area of one region (UNSEEN: surface outside of any)."""
@@ -64,7 +67,8 @@ class Outcome:
     pass was to serve and did not, `empty_mm` (e, 3) those of them where hidden space was expected to begin with surface
     and none was found near. `agreement` says how well its points lie on what was known; None: not looked at.
     `doubt` is what the operator is told when they do not. `expected_mm2` is what was
-    not promised but expected of hidden space that might be empty, and `found_mm2` what of that was found.
+    explored and not promised, and `found_mm2` what of that was found. `promised_between_mm2` and
+    `expected_between_mm2` are the intervals in which they were to lie; None: of a time when none were told.
     """
 
     regions: tuple[RegionOutcome, ...]
@@ -76,6 +80,8 @@ class Outcome:
     expected_mm2: float = 0.0
     found_mm2: float = 0.0
     empty_mm: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))
+    promised_between_mm2: Interval | None = None
+    expected_between_mm2: Interval | None = None
 
     def __post_init__(self) -> None:
         read_only(self.missed_mm)
@@ -95,8 +101,10 @@ class Outcome:
         """For JSON."""
         return {
             "promised_mm2": self.promised_mm2,
+            "promised_between_mm2": _listed(self.promised_between_mm2),
             "reached_mm2": self.reached_mm2,
             "expected_mm2": self.expected_mm2,
+            "expected_between_mm2": _listed(self.expected_between_mm2),
             "found_mm2": self.found_mm2,
             "besides_mm2": self.besides_mm2,
             "agreement": self.agreement.to_dict() if self.agreement else None,
@@ -140,7 +148,20 @@ class Outcome:
             expected_mm2=float(kept.get("expected_mm2", 0.0)),
             found_mm2=float(kept.get("found_mm2", 0.0)),
             empty_mm=empty,
+            promised_between_mm2=_interval(kept.get("promised_between_mm2")),
+            expected_between_mm2=_interval(kept.get("expected_between_mm2")),
         )
+
+
+def _listed(interval: Interval | None) -> list[float] | None:
+    return None if interval is None else list(interval)
+
+
+def _interval(kept: Any) -> Interval | None:
+    if kept is None:
+        return None
+    low, high = kept
+    return float(low), float(high)
 
 
 def reckon(
@@ -183,7 +204,7 @@ def reckon(
     missed[measured] &= ~good
     away, _ = _nearest(done.places_mm[reached > 0], done.places_mm, _BESIDE_MM)
     empty = missed & ~np.isfinite(away) & np.isin(done.place_evidence, HIDDEN_KINDS)
-    promised = done.is_promised
+    promised, said, explores = done.is_promised, done.promised, done.explores
     regions = [
         RegionOutcome(int(region), float(done.place_mm2[mine].sum()), float(reached[mine].sum()))
         for region in np.unique(done.place_regions)
@@ -198,9 +219,11 @@ def reckon(
         besides_mm2=float(area_mm2[~is_owned].sum()),
         agreement=agreement,
         doubt=agreement.doubt(done.turn),
-        expected_mm2=float(done.place_mm2[~promised].sum()),
+        expected_mm2=explores.mm2,
         found_mm2=float(reached[~promised].sum()),
         empty_mm=done.places_mm[empty],
+        promised_between_mm2=(said.low_mm2, said.high_mm2),
+        expected_between_mm2=(explores.low_mm2, explores.high_mm2),
     )
 
 
@@ -269,7 +292,7 @@ def _kinds(done: RecommendedPass, reached_mm2: Float64Array) -> tuple[KindOutcom
     for kind in Evidence:
         mine = done.place_evidence == kind
         if mine.any():
-            asked = float(done.place_mm2[mine].sum()) / done.chances[kind]
+            asked = float(done.place_mm2[mine].sum()) / done.learned.chances[kind]
             found.append(KindOutcome(kind, asked, float(reached_mm2[mine].sum())))
     return tuple(found)
 

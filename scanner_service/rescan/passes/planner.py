@@ -5,25 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.scanline import Pose
+from drivers.scanline import BoolArray, Pose
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.cover import Choice, Cover
+from scanner_service.rescan.passes.gain import MARGIN, SERVED, Prospect, prospect_of
 from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.looks import Look
-from scanner_service.rescan.passes.needs import (
-    FIRST_CHANCES,
-    UNSEEN,
-    Chances,
-    Needs,
-    Wanted,
-    failing_points,
-    find_needs,
-)
+from scanner_service.rescan.passes.needs import UNSEEN, Needs, Wanted, failing_points, find_needs
 from scanner_service.rescan.passes.nominal import missing_of
 from scanner_service.rescan.passes.optics import ScannerOptics
+from scanner_service.rescan.passes.promises import NO_EXPERIENCE, Experience
 from scanner_service.rescan.passes.reach import Reach
 from scanner_service.rescan.passes.recommendation import Plan, Promise, RecommendedPass
 from scanner_service.rescan.passes.serving import EVERYTHING, Serving
+from scanner_service.rescan.passes.stretch import Stretch
 from scanner_service.rescan.passes.tried import Tried
 from scanner_service.rescan.passes.unreachable import in_vain, lost_regions, unreachable
 from scanner_service.rescan.passes.visibility import look_around
@@ -33,7 +28,10 @@ from scanner_service.rescan.regions import RegionReport
 from scanner_service.rescan.requirement import Requirement
 
 MAX_NEEDS = 4_000
-"""More places than this are thinned at random, each that is left standing for more area."""
+"""Passes are chosen by so many places; more are thinned at random for that, each that is left standing for more area.
+What the chosen pass serves and promises is then worked out for all of them."""
+MAX_SERVED = 12_000
+"""... and of what it serves so many places are kept for the reckoning afterwards."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +40,15 @@ class Wishes:
 
     `requirement` asks for more than a density: line spacing, chord error, incidence. `serving` names what is to be
     served; unseen surface only when nothing is named. `explore` reckons with surface where hidden space begins,
-    outside of any region. `chances` are how much good surface each kind of evidence has proved to bring
-    (`experience.chances_of`).
+    outside of any region. `learned` is how much good surface each kind of evidence has proved to bring
+    (`experience.experience_of`).
     """
 
     density_per_mm2: float
     max_passes: int = 6
     least_gain_mm2: float = 1.0
     explore: bool = True
-    chances: Chances = FIRST_CHANCES
+    learned: Experience = NO_EXPERIENCE
     cell_mm: float | None = None
     requirement: Requirement | None = None
     serving: Serving = EVERYTHING
@@ -87,20 +85,24 @@ def plan_passes(
     missing = None if reference is None else missing_of(reference, regions)
     wanted = Wanted.of(wishes.density_per_mm2, wishes.requirement)
     explore = wishes.explore and wishes.serving.is_everything
-    needs = find_needs(snapshot, report, surface, wanted, wishes.chances, explore, regions, missing)
+    needs = find_needs(snapshot, report, surface, wanted, wishes.learned.chances, explore, regions, missing)
     if not wishes.serving.is_everything:
         named = [one.number for one in regions if wishes.serving.wants(one)]
         needs = needs.only(np.isin(needs.region, named))
-    needs, given_up = (tried or Tried.nothing()).of(needs, surface.cell_mm)
-    needs = _thinned(needs)
+    every, given_up = (tried or Tried.nothing()).of(needs, surface.cell_mm)
+    needs = _thinned(every, MAX_NEEDS)
     sky = look_around(surface, needs.places_mm, needs.normals, optics.max_camera_rad)
     cover = Cover(surface, needs, sky, reach, optics)
     passes: list[RecommendedPass] = []
+    left = np.ones(len(every), dtype=np.bool_)
     while len(passes) < wishes.max_passes:
         choice = cover.next(standing)
         if choice is None or choice.stretch.gain_mm2 < wishes.least_gain_mm2:
             break
-        one = _recommend(len(passes) + 1, choice, needs, reach, standing, wishes)
+        prospect = prospect_of(surface, every, choice.motion, optics) if every is not needs else choice.prospect
+        served = left & _served_by(choice.stretch, prospect)
+        left &= ~served
+        one = _recommend(len(passes) + 1, choice, every, prospect, served, reach, standing, wishes)
         passes.append(one)
         standing = one.end_pose
     lost = unreachable(needs, cover.reachable, cover.attitudes, sky, optics) + in_vain(given_up, needs)
@@ -109,20 +111,32 @@ def plan_passes(
     return Plan(report.version, tuple(passes), lost, needed, asked, lost_regions(lost))
 
 
-def _thinned(needs: Needs) -> Needs:
-    if len(needs) <= MAX_NEEDS:
+def _served_by(stretch: Stretch, prospect: Prospect) -> BoolArray:
+    """(n,) what a pass serves; its margin is for choosing: what gets enough with less of it is a gain as well."""
+    return stretch.serves(prospect.position_mm, MARGIN / SERVED * prospect.coarsest_mm)
+
+
+def _thinned(needs: Needs, most: int) -> Needs:
+    if len(needs) <= most:
         return needs
     rng = np.random.default_rng(len(needs))  # the same needs give the same plan
     keep = np.zeros(len(needs), dtype=np.bool_)
-    keep[rng.permutation(len(needs))[:MAX_NEEDS]] = True
+    keep[rng.permutation(len(needs))[:most]] = True
     fewer = needs.only(keep)
     return fewer.changed(area_mm2=fewer.area_mm2 * (float(needs.area_mm2.sum()) / float(fewer.area_mm2.sum())))
 
 
 def _recommend(
-    number: int, choice: Choice, needs: Needs, reach: Reach, standing: Pose | None, wishes: Wishes
+    number: int,
+    choice: Choice,
+    needs: Needs,
+    prospect: Prospect,
+    served: BoolArray,
+    reach: Reach,
+    standing: Pose | None,
+    wishes: Wishes,
 ) -> RecommendedPass:
-    stretch, prospect, served = choice.stretch, choice.prospect, choice.served
+    stretch = choice.stretch
     spacing = stretch.line_spacing_mm
     promises = []
     for region in np.unique(needs.region[served]):
@@ -139,6 +153,7 @@ def _recommend(
         )
     promises.sort(key=lambda promise: -promise.gain_mm2)
     start = choice.motion.part_from_sensor(stretch.start_mm)
+    kept = _thinned(needs.only(served), MAX_SERVED)
     return RecommendedPass(
         number=number,
         motion=choice.motion,
@@ -149,12 +164,13 @@ def _recommend(
         duration_s=reach.seconds(stretch.end_mm - stretch.start_mm, spacing),
         approach_s=reach.seconds_between(standing, start, choice.attitude.turn),
         promises=tuple(promises),
-        places_mm=needs.places_mm[served],
-        place_regions=needs.region[served].astype(np.float64),
-        place_mm2=needs.gain_mm2[served],
-        place_area_mm2=needs.area_mm2[served],
-        place_evidence=needs.evidence[served].astype(np.float64),
-        place_normals=needs.normals[served],
+        places_mm=kept.places_mm,
+        place_regions=kept.region.astype(np.float64),
+        place_mm2=kept.gain_mm2,
+        place_area_mm2=kept.area_mm2,
+        place_evidence=kept.evidence.astype(np.float64),
+        place_normals=kept.normals,
+        place_tried=kept.tried,
         turn=choice.attitude.turn,
-        chances=wishes.chances,
+        learned=wishes.learned,
     )

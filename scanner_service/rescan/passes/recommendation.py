@@ -9,10 +9,15 @@ import numpy as np
 from drivers.rig_limits import lines_between
 from drivers.scanline import BoolArray, Float64Array, Pose, read_only
 from scanner_service.rescan.passes.motion import Motion, StraightMotion
-from scanner_service.rescan.passes.needs import FIRM_KINDS, FIRST_CHANCES, UNSEEN, Chances
+from scanner_service.rescan.passes.needs import UNSEEN
+from scanner_service.rescan.passes.promises import (
+    NO_EXPERIENCE,
+    Expectation,
+    Experience,
+    expectation_of,
+    promised_places,
+)
 from scanner_service.rescan.passes.reach import PartTurn
-
-_UNTRIED = 0.45  # of what its kind promises: less is left of a place that a pass was in vain for
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +51,9 @@ class RecommendedPass:
     `duration_s` is the time of the pass itself, `approach_s` the time to get there (turning the part included);
     `promises` what it is to give, region by region; `gain_mm2` their sum. `places_mm` (k, 3) are the places served,
     `place_regions` (k,) their regions, `place_evidence` (k,) why they are believed in, `place_area_mm2` (k,) their
-    areas, `place_mm2` (k,) what of these is promised, and `place_normals` (k, 3) where they face; they are kept for the
-    reckoning afterwards. `turn` is what the operator does first; `chances` (by evidence) are what the
-    promises were multiplied by, from earlier outcomes.
+    areas, `place_mm2` (k,) what of these is expected, `place_normals` (k, 3) where they face, and `place_tried` (k,)
+    where passes were in vain; they are kept for the reckoning afterwards. `turn` is what the operator does first;
+    `learned` is what earlier passes taught, by which the areas were multiplied.
     """
 
     number: int
@@ -66,13 +71,14 @@ class RecommendedPass:
     place_area_mm2: Float64Array
     place_evidence: Float64Array
     place_normals: Float64Array
+    place_tried: BoolArray
     turn: PartTurn | None = None
-    chances: Chances = FIRST_CHANCES
+    learned: Experience = NO_EXPERIENCE
 
     def __post_init__(self) -> None:
         for array in (
             self.places_mm, self.place_regions, self.place_mm2, self.place_area_mm2, self.place_evidence,
-            self.place_normals,
+            self.place_normals, self.place_tried,
         ):  # fmt: skip
             read_only(array)
 
@@ -83,20 +89,26 @@ class RecommendedPass:
 
     @property
     def is_promised(self) -> BoolArray:
-        """(k,) the places served that are promised; the others are hidden space that may well be empty: explored."""
-        kind = self.place_evidence.astype(np.int64)
-        untried = self.place_mm2 > _UNTRIED * self.place_area_mm2 * np.array(self.chances)[kind]
-        return np.asarray(np.isin(kind, FIRM_KINDS) & untried)
+        """(k,) the places served that are promised; what of the others is there is too unsure: they are explored."""
+        return promised_places(
+            self.place_mm2, self.place_area_mm2, self.place_evidence, self.place_tried, self.learned
+        )  # fmt: skip
 
     @property
-    def promised_mm2(self) -> float:
+    def promised(self) -> Expectation:
         """What of the gain is promised."""
-        return float(self.place_mm2[self.is_promised].sum())
+        return self._expected(self.is_promised)
 
     @property
-    def explores_mm2(self) -> float:
-        """What of the gain is expected of hidden space that may well be empty."""
-        return max(0.0, self.gain_mm2 - self.promised_mm2)
+    def explores(self) -> Expectation:
+        """What of the gain is expected where much more, or nothing, may be found."""
+        return self._expected(~self.is_promised)
+
+    def _expected(self, places: BoolArray) -> Expectation:
+        return expectation_of(
+            self.place_mm2[places], self.place_area_mm2[places], self.place_evidence[places],
+            self.place_tried[places], self.learned,
+        )  # fmt: skip
 
     @property
     def gain_per_s(self) -> float:
@@ -128,6 +140,7 @@ class RecommendedPass:
 
     def to_dict(self) -> dict[str, object]:
         """For JSON; what a person or a rig needs to carry it out."""
+        promised, explores = self.promised, self.explores
         return {
             "number": self.number,
             "start_mm": self.start_mm,
@@ -144,8 +157,10 @@ class RecommendedPass:
             "laser_direction": (-self.start_pose.rotation[:, 2]).tolist(),
             "turn_part": None if self.turn is None or self.turn.is_none else str(self.turn),
             "gain_mm2": self.gain_mm2,
-            "promised_mm2": self.promised_mm2,
-            "explores_mm2": self.explores_mm2,
+            "promised_mm2": promised.mm2,
+            "promised_between_mm2": promised.between_mm2,
+            "explores_mm2": explores.mm2,
+            "explores_between_mm2": explores.between_mm2,
             "gain_per_s_mm2": self.gain_per_s,
             "serves": [promise.to_dict() for promise in self.promises],
         }
@@ -185,7 +200,7 @@ class Plan:
     @property
     def promised_mm2(self) -> float:
         """What the listed passes promise together."""
-        return sum(one.promised_mm2 for one in self.passes)
+        return sum(one.promised.mm2 for one in self.passes)
 
     def to_dict(self) -> dict[str, object]:
         """For JSON."""
@@ -193,7 +208,7 @@ class Plan:
             "version": self.version,
             "needed_mm2": self.needed_mm2,
             "promised_mm2": self.promised_mm2,
-            "explores_mm2": sum(one.explores_mm2 for one in self.passes),
+            "explores_mm2": sum(one.explores.mm2 for one in self.passes),
             "passes": [one.to_dict() for one in self.passes],
             "unreachable": [one.to_dict() for one in self.unreachable],
         }

@@ -51,7 +51,8 @@ class Tried:
         around = np.zeros(len(needs))
         around[hidden] = _times(self.empty_mm, needs.places_mm[hidden], _AROUND_MM)
         lowered = needs.changed(
-            chance=needs.chance * np.minimum(LOWERED**times, EMPTIED ** np.minimum(around, TRIES - 1))
+            chance=needs.chance * np.minimum(LOWERED**times, EMPTIED ** np.minimum(around, TRIES - 1)),
+            tried=(times > 0) | (around > 0),
         )
         return lowered.only(~given_up), needs.only(given_up)
 

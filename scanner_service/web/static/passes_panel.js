@@ -18,10 +18,20 @@ export function served(pass) {
   return [regions, unseen].filter(Boolean).join(" and ");
 }
 
+// An area as it was foretold, with the interval in which it lies four times in five: "12 (8 to 15)".
+const area = (mm2, between) => `${significant(mm2)}${between ? ` (${significant(between[0], 2)} to ${significant(between[1], 2)})` : ""}`;
+
+// What a pass promises, and what it explores: "promises 12 (8 to 15), explores for 30 (0 to 80) mm²".
+export function foretold({ promised_mm2, promised_between_mm2, explores_mm2, explores_between_mm2 }) {
+  const promised = promised_mm2 >= 0.5 ? `promises ${area(promised_mm2, promised_between_mm2)}` : "";
+  const explores = explores_mm2 >= 0.5 || !promised ? `explores for ${area(explores_mm2, explores_between_mm2)}` : "";
+  return `${[promised, explores].filter(Boolean).join(", ")} mm²`;
+}
+
 // What became of an order that is over, in words; "" while nothing has.
 export function fate({ status, message, outcome, reached_end: whole }) {
-  const said = outcome ? `promised ${significant(outcome.promised_mm2)}, reached ${significant(outcome.reached_mm2)} mm²` : "";
-  const explored = outcome?.expected_mm2 >= 1 ? `explored: ${significant(outcome.found_mm2)} found of ${significant(outcome.expected_mm2)} mm² expected` : "";
+  const said = outcome ? `promised ${area(outcome.promised_mm2, outcome.promised_between_mm2)}, reached ${significant(outcome.reached_mm2)} mm²` : "";
+  const explored = outcome?.expected_mm2 >= 1 ? `explored: ${significant(outcome.found_mm2)} found, ${area(outcome.expected_mm2, outcome.expected_between_mm2)} mm² expected` : "";
   const early = status === "done" && whole === false ? "ended before its end" : "";
   return [said, explored, early, message].filter(Boolean).join("; ");
 }
@@ -117,7 +127,7 @@ export class PassesPanel {
       element("strong", {}, `Pass ${one.number}: ${significant(one.gain_mm2)}`, unit("mm²"), ` in ${significant(one.duration_s + one.approach_s, 2)}`, unit("s")),
       element("span", {}, ...way(one)),
       element("span", {}, `for ${served(one) || "nothing"}`),
-      one.explores_mm2 > 0.5 * one.gain_mm2 ? element("span", {}, "Explores: most of it may not be there.") : null,
+      element("span", {}, sentence(foretold(one))),
       one.turn_part ? element("span", {}, `First: ${one.turn_part}.`) : null,
       element("button", { type: "button", onclick: () => this.#act(() => acceptPass(this.#id, one.number, plan)) }, "Accept"),
     );

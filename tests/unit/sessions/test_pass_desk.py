@@ -10,9 +10,9 @@ import pytest
 from drivers.rig_limits import AxisKind
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.errors import RigUnlimited
-from scanner_service.rescan.passes.needs import FIRST_CHANCES
 from scanner_service.rescan.passes.outcome import Outcome
 from scanner_service.rescan.passes.planner import plan_passes
+from scanner_service.rescan.passes.promises import NO_EXPERIENCE
 from scanner_service.rescan.passes.serving import Serving
 from scanner_service.rescan.passes.tried import TRIES
 from scanner_service.rescan.reference import ReferenceSurface
@@ -91,8 +91,8 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
     desk.wait_for(order)
     assert order.status is PassStatus.DONE
     assert order.reached_end and order.teaches
-    assert order.outcome.promised_mm2 == pytest.approx(one.promised_mm2)
-    assert order.outcome.expected_mm2 == pytest.approx(one.explores_mm2)
+    assert order.outcome.promised_mm2 == pytest.approx(one.promised.mm2)
+    assert order.outcome.expected_mm2 == pytest.approx(one.explores.mm2)
     assert order.outcome.reached_mm2 > 0.7 * order.outcome.promised_mm2
     assert desk.plan().version > plan.version
     assert desk.plan().needed_mm2 < plan.needed_mm2
@@ -415,7 +415,7 @@ def test_a_pass_that_was_stopped_or_failed_teaches_nothing(book, scanned, tmp_pa
         assert not any(order.teaches for order in reopened.orders())
         reopened.describe_rig(RigSetup(free_reach(30.0), OPTICS))
         for now in (again, reopened.plan()):
-            assert now.passes[0].chances == pytest.approx(FIRST_CHANCES)
+            assert now.passes[0].learned == NO_EXPERIENCE
             assert not any("passes that should have seen it" in lost.why for lost in now.unreachable)
             if not lines_share:  # nothing was seen: all is wanted as before, and no way is known
                 assert now.promised_mm2 == pytest.approx(plan.promised_mm2)

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 const { inWords, presetOf, reached, refusalsByField, requestOf, textsOf } = await import("../../../scanner_service/web/static/requirement_form.js");
-const { fate, served } = await import("../../../scanner_service/web/static/passes_panel.js");
+const { fate, foretold, served } = await import("../../../scanner_service/web/static/passes_panel.js");
 const { opening } = await import("../../../scanner_service/web/static/numbers.js");
 
 const STANDARD = { preset: "standard", density_per_mm2: null, density_share: 0.5, line_spacing_mm: null, chord_error_mm: null, finest_line_spacing_mm: 0.05, incidence_deg: null, noise_mm: null, coverage_share: 0.95, interest: null };
@@ -56,11 +56,20 @@ test("messages begin with a capital, names are left as they are", () => {
   for (const named of ["bun000.ply has no points", "noise_mm asks for less", "part: it cannot be read", "ttyUSB0 is gone", "3 sessions are open", ""]) assert.equal(opening(named), named);
 });
 
+test("a pass says what it promises, what it explores, and between what both will lie", () => {
+  const pass = { promised_mm2: 12, promised_between_mm2: [8.04, 15], explores_mm2: 30, explores_between_mm2: [0, 81.3] };
+  assert.equal(foretold(pass), "promises 12 (8 to 15), explores for 30 (0 to 81) mm²");
+  assert.equal(foretold({ ...pass, explores_mm2: 0.1 }), "promises 12 (8 to 15) mm²");
+  assert.equal(foretold({ ...pass, promised_mm2: 0 }), "explores for 30 (0 to 81) mm²");
+});
+
 test("a pass names its regions as the list does, an order what became of it", () => {
   const serves = [{ region: 7 }, { region: 3 }, { region: null }];
   assert.equal(served({ serves }), "regions 7, 3 and unseen surface");
   assert.equal(served({ serves: serves.slice(0, 1) }), "region 7");
   assert.equal(fate({ status: "accepted", message: null, outcome: null, reached_end: false }), "");
   assert.equal(fate({ status: "done", message: null, outcome: { promised_mm2: 12, reached_mm2: 4 }, reached_end: false }), "promised 12, reached 4 mm²; ended before its end");
+  const outcome = { promised_mm2: 12, promised_between_mm2: [8.04, 15], reached_mm2: 9, expected_mm2: 30, expected_between_mm2: [0, 81.3], found_mm2: 55 };
+  assert.equal(fate({ status: "done", message: null, outcome, reached_end: true }), "promised 12 (8 to 15), reached 9 mm²; explored: 55 found, 30 (0 to 81) mm² expected");
   assert.equal(fate({ status: "failed", message: "the port is gone", outcome: null, reached_end: false }), "the port is gone");
 });

@@ -174,7 +174,9 @@ def test_optics_that_cannot_be_meant_are_refused():
 
 def wanted_pass():
     nothing, none = np.zeros((0, 3)), (np.zeros(0) for _ in range(4))
-    return RecommendedPass(1, FROM_ABOVE, 0.0, 40.0, 0.2, 50.0, 4.0, 0.0, (), nothing, *none, nothing.copy())
+    return RecommendedPass(
+        1, FROM_ABOVE, 0.0, 40.0, 0.2, 50.0, 4.0, 0.0, (), nothing, *none, nothing.copy(), np.zeros(0, bool)
+    )
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,12 @@
 """What a pass promised and what was found: to which place new surface belongs, what is a promise and what exploring."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from scanner_service.rescan.passes.needs import FIRM_KINDS, FIRST_CHANCES, HIDDEN_KINDS, Evidence
+from scanner_service.rescan.passes.needs import FIRST_CHANCES, HIDDEN_KINDS, Evidence
 from scanner_service.rescan.passes.outcome import Outcome, owners_of, reckon
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.passes.recommendation import Promise, RecommendedPass
-from scanner_service.rescan.passes.tried import LOWERED
 from simulators.parts import step
 from tests.unit.rescan.passes.posed_scans import DENSITY, FROM_ABOVE, OPTICS, Bench, free_reach
 
@@ -23,7 +20,7 @@ def served(places_mm, kinds, mm2=None, area_mm2=None):
     return RecommendedPass(
         1, FROM_ABOVE, -5.0, 45.0, 0.2, 50.0, 4.0, 0.0, (Promise(0, float(mm2.sum()), 20.0, 0.0, 0.0),),
         np.array(places_mm, dtype=np.float64), np.zeros(n), mm2, area, np.array(kinds, dtype=np.float64),
-        np.tile([0.0, 0.0, 1.0], (n, 1)),
+        np.tile([0.0, 0.0, 1.0], (n, 1)), np.zeros(n, dtype=bool),
     )  # fmt: skip
 
 
@@ -38,15 +35,6 @@ def test_surface_behind_the_border_of_hidden_space_belongs_to_the_place_its_ray_
     assert owner.tolist() == [0 if kind in HIDDEN_KINDS else -1, -1, 1, -1]
 
 
-def test_hidden_space_that_may_well_be_empty_is_explored_and_not_promised():
-    places = [[0.0, float(y), 0.0] for y in range(len(Evidence))]
-    one = served(places, tuple(Evidence))
-    assert one.promised_mm2 == pytest.approx(sum(FIRST_CHANCES[kind] for kind in FIRM_KINDS))
-    assert one.promised_mm2 + one.explores_mm2 == pytest.approx(one.gain_mm2)
-    tried = dataclasses.replace(one, place_mm2=one.place_mm2 * LOWERED)  # a pass was in vain there
-    assert tried.promised_mm2 == 0.0
-
-
 def test_what_was_promised_what_was_explored_and_what_was_found_besides_is_all_that_is_new():
     bench = Bench(step().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.5)
     before = bench.judged()
@@ -54,6 +42,8 @@ def test_what_was_promised_what_was_explored_and_what_was_found_besides_is_all_t
     bench.scan(one.motion, one.start_mm, one.end_mm, one.line_spacing_mm)
     outcome = reckon(one, *before, *bench.judged(), OPTICS)
     assert outcome.promised_mm2 + outcome.expected_mm2 == pytest.approx(one.gain_mm2)
+    assert list(outcome.promised_between_mm2) == one.to_dict()["promised_between_mm2"]
+    assert Outcome.from_dict(outcome.to_dict()).to_dict() == outcome.to_dict()
     asked = sum(kind.asked_mm2 * FIRST_CHANCES[kind.evidence] for kind in outcome.kinds)
     assert asked == pytest.approx(one.gain_mm2)
     reached = outcome.reached_mm2 + outcome.found_mm2
@@ -69,5 +59,8 @@ def test_what_was_promised_what_was_explored_and_what_was_found_besides_is_all_t
 def test_an_outcome_of_a_record_that_told_kinds_otherwise_is_read_and_teaches_nothing_of_them():
     now = Outcome((), np.zeros((1, 3))).to_dict()
     kept = now | {"kinds": [{"evidence": "frontier", "asked_mm2": 4.0, "kept_mm2": 3.0}], "missed_mm": [[1, 2, 3]]}
+    for name in ("promised_between_mm2", "expected_between_mm2"):  # nobody told them then
+        del kept[name]
     outcome = Outcome.from_dict(kept)
+    assert outcome.promised_between_mm2 is None and outcome.to_dict()["expected_between_mm2"] is None
     assert outcome.kinds == () and outcome.missed_mm.tolist() == [[1.0, 2.0, 3.0]]

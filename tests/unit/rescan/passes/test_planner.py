@@ -7,9 +7,11 @@ import pytest
 
 from drivers.scanline import Pose
 from scanner_service.rescan.judgement import Reason
+from scanner_service.rescan.passes import planner
 from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.looks import look_of
 from scanner_service.rescan.passes.marching import FREE, HIDDEN
+from scanner_service.rescan.passes.needs import Evidence, failing_points
 from scanner_service.rescan.passes.outcome import reckon
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.passes.serving import Serving
@@ -77,11 +79,20 @@ def test_passes_are_told_in_plain_numbers_the_best_for_its_time_first():
         assert one.line_count == len(np.arange(one.start_mm, one.end_mm + 1e-9, one.line_spacing_mm))
 
 
-def test_no_place_is_promised_twice():
+def test_no_place_is_promised_twice_and_none_for_others_by_whichever_places_passes_were_chosen(monkeypatch):
     bench = Bench(step().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.7)
-    plan = plan_passes(*bench.judged(), free_reach(), OPTICS, Wishes(DENSITY, max_passes=5))
+    judged = bench.judged()
+    monkeypatch.setattr(planner, "MAX_NEEDS", 150)
+    plan = plan_passes(*judged, free_reach(), OPTICS, Wishes(DENSITY, max_passes=5))
     places = np.concatenate([one.places_mm for one in plan.passes])
-    assert len(np.unique(places, axis=0)) == len(places)
+    assert len(places) > 600 and len(np.unique(places, axis=0)) == len(places)
+    cell_mm = know_surface(judged[0], *failing_points(judged[1])).cell_mm
+    areas = np.concatenate([one.place_area_mm2[one.place_evidence != Evidence.FLOOR] for one in plan.passes])
+    assert areas.max() <= 2.0 * cell_mm**2 + 1e-9  # each stands for its own cell
+    monkeypatch.setattr(planner, "MAX_SERVED", 100)
+    few = plan_passes(*judged, free_reach(), OPTICS, Wishes(DENSITY, max_passes=1)).passes[0]
+    assert few.promises == plan.passes[0].promises and len(few.places_mm) == 100
+    assert few.place_area_mm2.sum() == pytest.approx(plan.passes[0].place_area_mm2.sum())
 
 
 def test_what_a_fixed_axis_cannot_see_is_unreachable_and_turning_the_part_helps():

@@ -1,4 +1,4 @@
-"""The proofs themselves: the benchmark's truth against formulas, sights against real scans, promises that learn."""
+"""The proofs themselves: the benchmark's truth against formulas, sights against real scans."""
 
 from pathlib import Path
 
@@ -7,9 +7,6 @@ import pytest
 
 from benchmarks.rescan_bunny import compare
 from benchmarks.scannable import Allowed, CoverageTruth, sample_surface, scannable
-from scanner_service.rescan.passes.experience import chances_of
-from scanner_service.rescan.passes.needs import FIRST_CHANCES, Evidence
-from scanner_service.rescan.passes.outcome import KindOutcome, Outcome, RegionOutcome
 from simulators.posed_rig import PosedScanner
 from simulators.shapes import Sphere, box
 from tests.unit.rescan.passes.posed_scans import FROM_ABOVE, SCANNER
@@ -47,28 +44,6 @@ def test_coverage_counts_what_was_scanned_densely_enough():
     assert truth.share == pytest.approx(0.5, abs=0.05)
     truth.add(posed.scan(FROM_ABOVE.part_from_sensor, 19.0, 41.0, 0.8))  # 10 points/mm2 over the other
     assert truth.share == pytest.approx(0.5, abs=0.05)
-
-
-def became(asked_mm2, reached_mm2, kind=Evidence.FRONTIER):
-    regions = (RegionOutcome(0, asked_mm2, reached_mm2),)
-    return Outcome(regions, np.zeros((0, 3)), (KindOutcome(kind, asked_mm2, reached_mm2),))
-
-
-def test_each_kind_of_evidence_is_believed_as_far_as_it_proved_true():
-    assert chances_of([]) == pytest.approx(FIRST_CHANCES)
-    learned = chances_of([became(400.0, 40.0)])
-    assert learned[Evidence.FRONTIER] < 0.4 * FIRST_CHANCES[Evidence.FRONTIER]
-    assert learned[Evidence.MEASURED] == pytest.approx(FIRST_CHANCES[Evidence.MEASURED])
-    ratios = [chances_of([became(400.0, 600.0)] * n)[Evidence.FRONTIER] for n in range(12)]
-    assert np.all(np.diff(ratios) > 0) and ratios[-1] == pytest.approx(1.5, rel=0.08)  # what comes again is learned
-    outlier = [became(50.0, 55.0)] * 4 + [became(1e4, 3e4)]  # one large pass does not decide
-    assert 1.1 < chances_of(outlier)[Evidence.FRONTIER] < 1.7
-    small = chances_of([became(0.5, 0.0)])[Evidence.FRONTIER]
-    assert small > 0.9 * FIRST_CHANCES[Evidence.FRONTIER]  # too small to learn from
-    beyond = became(400.0, 0.0, Evidence.BEYOND)
-    later = [became(100.0, 100.0)] * 5  # passes that had no such places teach nothing of them
-    assert chances_of([beyond, *later])[Evidence.BEYOND] == chances_of([beyond])[Evidence.BEYOND] < 0.5
-    assert chances_of([became(1e6, 0.0)] * 50)[Evidence.FRONTIER] > 0.09  # nothing is ruled out for good
 
 
 @pytest.mark.skipif(not BUNNY.is_dir(), reason="the real scans lie beside the checkout, and are not there")

@@ -15,7 +15,9 @@ FULL_TURN_MM = 2 * np.pi * 20.0
 
 def wanted(motion, end_mm):
     nothing, none = np.zeros((0, 3)), [np.zeros(0) for _ in range(4)]
-    return RecommendedPass(1, motion, 0.0, end_mm, 0.2, 50.0, 4.0, 0.0, (), nothing, *none, nothing.copy())
+    return RecommendedPass(
+        1, motion, 0.0, end_mm, 0.2, 50.0, 4.0, 0.0, (), nothing, *none, nothing.copy(), np.zeros(0, bool)
+    )
 
 
 def lasers(motion, positions_mm):

@@ -1,5 +1,6 @@
 """Plans for named regions and reasons, for more than density, and for the nominal part; passes kept and read again."""
 
+import base64
 import dataclasses
 import json
 
@@ -11,6 +12,7 @@ from scanner_service.rescan.passes.kept_pass import keep_pass, kept_pass
 from scanner_service.rescan.passes.motion import TurningMotion
 from scanner_service.rescan.passes.needs import UNSEEN
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
+from scanner_service.rescan.passes.promises import FIRST_SPREADS
 from scanner_service.rescan.passes.serving import Serving
 from scanner_service.rescan.reference import ReferenceSurface, reference_coverage
 from scanner_service.rescan.requirement import Requirement
@@ -106,7 +108,8 @@ def test_a_kept_pass_is_the_pass_that_was_kept(coarse):
     one = plan_passes(*coarse, linear_reach(part_may_turn=True), OPTICS, Wishes(DENSITY, max_passes=1)).passes[0]
     again = kept_pass(json.loads(json.dumps(keep_pass(one), allow_nan=False)))
     told, expected = again.to_dict(), one.to_dict()
-    for name in ("promised_mm2", "explores_mm2"):  # sums over places, of which seven digits are kept
+    names = ("promised_mm2", "explores_mm2", "promised_between_mm2", "explores_between_mm2")
+    for name in names:  # sums over places, of which seven digits are kept
         assert told.pop(name) == pytest.approx(expected.pop(name), abs=1e-4)
     assert told == expected
     assert again.places_mm == pytest.approx(one.places_mm, abs=1e-4)
@@ -116,8 +119,32 @@ def test_a_kept_pass_is_the_pass_that_was_kept(coarse):
     assert isinstance(motion, TurningMotion) and motion.radius_mm == 20.0
 
 
+@pytest.mark.parametrize("without", [(), ("spreads",), ("spreads", "columns")])
+def test_a_pass_of_an_older_record_opens_with_what_nobody_kept_then_as_it_is_at_first(coarse, without):
+    one = plan_passes(*coarse, linear_reach(), OPTICS, Wishes(DENSITY, max_passes=1)).passes[0]
+    half = np.arange(len(one.places_mm)) % 2 == 0
+    one = dataclasses.replace(one, place_tried=half, place_mm2=one.place_mm2 * np.where(half, 0.2, 1.0))
+    kept = {name: value for name, value in keep_pass(one).items() if name not in without}
+    if "columns" in without:  # then what was tried was told from how little was left of it
+        rows = np.frombuffer(base64.b64decode(kept["places"]), dtype="<f4").reshape(-1, 11)[:, :10]
+        kept["places"] = base64.b64encode(rows.tobytes()).decode()
+    again = kept_pass(kept)
+    assert again.place_tried.tolist() == half.tolist()
+    assert again.learned.spreads == FIRST_SPREADS
+    assert again.promised.mm2 == pytest.approx(one.promised.mm2, rel=1e-5)
+
+
 @pytest.mark.parametrize(
-    ("name", "value"), [("places", "AAAA"), ("places", "?"), ("motion", {"at_zero": None}), ("promises", [[1]])]
+    ("name", "value"),
+    [
+        ("places", "AAAA"),
+        ("places", "?"),
+        ("motion", {"at_zero": None}),
+        ("promises", [[1]]),
+        ("columns", 7),
+        ("columns", 0),
+        ("spreads", [0.1] * 9),
+    ],
 )
 def test_what_was_not_kept_so_is_refused(coarse, name, value):
     one = plan_passes(*coarse, linear_reach(), OPTICS, Wishes(DENSITY, max_passes=1)).passes[0]
