@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from drivers.scanline import Float64Array
 from scanner_service.rescan.passes.needs import FIRST_CHANCES, HIDDEN_KINDS, Evidence
 from scanner_service.rescan.passes.outcome import Outcome
 from scanner_service.rescan.passes.promises import FIRST_SPREADS, GRAINS_MM2, Experience
@@ -15,6 +16,7 @@ _ENOUGH_MM2 = 50.0  # a pass that asked for so much counts half of that, and non
 _HALF_MM2 = 20.0  # of how a kind varies a pass that asked for so much tells half as much as a very large one ...
 _FIRST_PASSES = 3.0  # ... of which the first spread weighs as many
 _LEAST = 0.05  # nothing is ruled out for good
+_WORN_PASSES = 8.0  # what is left of hidden space when so many passes have looked is surface 1/e as often
 
 
 def experience_of(earlier: Sequence[Outcome]) -> Experience:
@@ -22,20 +24,23 @@ def experience_of(earlier: Sequence[Outcome]) -> Experience:
 
     The mean of what was reached for what was asked for, in which one large pass over a side that is unlike the others
     does not decide; of a place that is known no more than its area. The spread is that of the passes around the mean,
-    less what small areas vary anyway.
+    less what small areas vary anyway. What is left of hidden space where passes looked in vain is the less likely
+    surface the more passes there were.
     """
+    worn = _worn(len(earlier))
     asked = np.full(len(Evidence), _FIRST_MM2)
-    reached = asked * np.array(FIRST_CHANCES)
+    reached = asked * np.array(FIRST_CHANCES) * worn
     faded = np.ones(len(Evidence))
     passes: list[list[tuple[float, float, float]]] = [[] for _ in Evidence]
-    for outcome in reversed(earlier):
-        for one in outcome.kinds:
+    for number in reversed(range(len(earlier))):
+        for one in earlier[number].kinds:
             if one.asked_mm2 > 0:
+                asked_mm2 = one.asked_mm2 * (_worn(number)[one.evidence] / worn[one.evidence])
                 counts = faded[one.evidence] / (1.0 + one.asked_mm2 / _ENOUGH_MM2)
-                asked[one.evidence] += counts * one.asked_mm2
+                asked[one.evidence] += counts * asked_mm2
                 reached[one.evidence] += counts * one.reached_mm2
                 tells = faded[one.evidence] * one.asked_mm2 / (one.asked_mm2 + _HALF_MM2)
-                passes[one.evidence].append((tells, one.reached_mm2 / one.asked_mm2, one.asked_mm2))
+                passes[one.evidence].append((tells, one.reached_mm2 / asked_mm2, one.asked_mm2))
                 faded[one.evidence] *= _FADING
     chances = np.maximum(reached / asked, _LEAST)
     known = [kind for kind in Evidence if kind not in HIDDEN_KINDS]
@@ -49,3 +54,10 @@ def experience_of(earlier: Sequence[Outcome]) -> Experience:
             weight += tells
         spreads.append(first * math.sqrt(square / weight))
     return Experience(tuple(chances.tolist()), tuple(spreads))
+
+
+def _worn(passes: int) -> Float64Array:
+    """By `Evidence`, how much less it brings after some passes than at first."""
+    worn = np.ones(len(Evidence))
+    worn[Evidence.REST] = math.exp(-passes / _WORN_PASSES)
+    return worn
