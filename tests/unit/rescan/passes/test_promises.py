@@ -1,6 +1,5 @@
 """What of a pass may be promised: laws of its sums and intervals, and how often outcomes drawn by chance keep them."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -158,7 +157,21 @@ def test_a_kind_that_brings_now_much_now_nothing_is_believed_in_less_surely_than
     assert spread(1.0, 1.0, 1.0, 1.0) < first < spread(0.0, 2.5, 0.1, 1.9)
     assert spread(*[1.0] * 12) < spread(1.0, 1.0) < first
     assert spread(0.0, asked_mm2=0.3) == pytest.approx(first, rel=0.05)  # a piece was not there: that was foretold
-    assert dataclasses.astuple(experience_of([became(0.0, 0.0)])) == dataclasses.astuple(NO_EXPERIENCE)
+    assert experience_of([became(0.0, 0.0)]).spreads == FIRST_SPREADS
+
+
+def test_the_more_passes_have_looked_the_less_is_expected_of_what_is_left_and_of_nothing_else():
+    def rest(*outcomes):
+        return experience_of(outcomes).chances[Evidence.REST]
+
+    idle = became(0.0, 0.0)
+    chances = np.array([rest(*[idle] * n) for n in range(17)])
+    assert chances == pytest.approx(FIRST_CHANCES[Evidence.REST] * np.exp(-np.arange(17) / 8.0))
+    others = [one for one in Evidence if one is not Evidence.REST]
+    assert [experience_of([idle] * 9).chances[one] for one in others] == [FIRST_CHANCES[one] for one in others]
+    as_foretold = became(50.0, 50.0 * rest(idle), Evidence.REST)
+    assert rest(idle, as_foretold) == pytest.approx(rest(idle, idle))  # what came as foretold changes nothing
+    assert rest(idle, became(50.0, 0.0, Evidence.REST)) < rest(idle, idle) < rest(idle, became(50, 500, Evidence.REST))
 
 
 def test_the_page_says_with_what_numbers_a_session_begins():
