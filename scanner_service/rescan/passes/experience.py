@@ -16,7 +16,7 @@ _ENOUGH_MM2 = 50.0  # a pass that asked for so much counts half of that, and non
 _HALF_MM2 = 20.0  # of how a kind varies a pass that asked for so much tells half as much as a very large one ...
 _FIRST_PASSES = 3.0  # ... of which the first spread weighs as many
 _LEAST = 0.05  # nothing is ruled out for good
-_WORN_PASSES = 8.0  # what is left of hidden space when so many passes have looked is surface 1/e as often
+_WORN_PASSES = 10.0  # what is left of hidden space when so many passes have looked is surface 1/e as often
 
 
 def experience_of(earlier: Sequence[Outcome]) -> Experience:

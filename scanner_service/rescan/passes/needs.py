@@ -56,7 +56,7 @@ HIDDEN_KINDS = (Evidence.FRONTIER, Evidence.BEYOND, Evidence.FAR, Evidence.REST)
 
 Chances = tuple[float, ...]
 """Good surface for each mm² that is believed in, by `Evidence`; of hidden space before edges are counted for less."""
-FIRST_CHANCES: Chances = (1.0, 0.75, 1.2, 0.9, 1.0, 1.0, 4.5)
+FIRST_CHANCES: Chances = (1.0, 0.75, 1.2, 0.9, 1.0, 1.0, 2.0)
 """... before a pass has shown it."""
 
 

@@ -10,9 +10,9 @@ from scanner_service.rescan.passes.needs import HIDDEN_KINDS, Needs
 
 TRIES = 3
 """So often a place is promised before it is given up."""
-LOWERED = 0.4
+LOWERED = 0.25
 """What a pass in vain leaves of the chance that a place is what it seems."""
-EMPTIED = 0.75
+EMPTIED = 0.5
 """... and of the chance of hidden space around."""
 _AROUND_MM = 2.0  # hidden space that goes on this near to where nothing was found
 
