@@ -94,16 +94,20 @@ def expectation_of(
 ) -> Expectation:
     """What places bring together; arguments as those of `promised_places`.
 
-    Each place is there or not, and each kind as a whole brings more or less than was foretold, for itself: squares add
-    up. Surface whose place is known cannot be more than its area.
+    Each place is there or not, and each kind as a whole brings more or less than was foretold. What may be promised
+    does so kind by kind, so that squares add up; the other kinds, which are there or not as the part has a side there,
+    rise and fall together. Surface whose place is known cannot be more than its area.
     """
-    low, high = 0.0, 0.0
+    low, high, less, more = 0.0, 0.0, 0.0, 0.0
     for lot in _lots(mm2, area_mm2, evidence, tried, learned):
         half = EIGHTY_PERCENT * lot.deviation_mm2
-        low += min(half, lot.mm2) ** 2
-        high += min(half, lot.most_mm2 - lot.mm2) ** 2
+        down, up = min(half, lot.mm2), min(half, lot.most_mm2 - lot.mm2)
+        if lot.may_be_promised:
+            low, high = math.hypot(low, down), math.hypot(high, up)
+        else:
+            less, more = less + down, more + up
     total = float(mm2.sum())
-    return Expectation(total, max(0.0, total - math.sqrt(low)), total + math.sqrt(high))
+    return Expectation(total, max(0.0, total - math.hypot(low, less)), total + math.hypot(high, more))
 
 
 def _lots(
