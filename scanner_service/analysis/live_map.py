@@ -20,18 +20,15 @@ from scanner_service.analysis.change_log import ChangeLog
 from scanner_service.analysis.describing import Records
 from scanner_service.analysis.errors import MapFull
 from scanner_service.analysis.flexible import flexible_radii_mm
+from scanner_service.analysis.fresh_blocks import blocks_to_evaluate, count_points, forget_fresh, mark_all_fresh
 from scanner_service.analysis.gathering import reserve_scratch
 from scanner_service.analysis.global_radius import GlobalRadius
 from scanner_service.analysis.grid import (
     BLOCKS,
     CELLS,
     CHUNKS,
-    blocks_to_evaluate,
     cell_side_q,
-    count_points,
-    forget_fresh,
     insert_points,
-    mark_all_fresh,
     remove_points,
     reserve_grid,
 )

@@ -39,6 +39,7 @@ from scanner_service.sessions.updates import VerdictBook
 T = TypeVar("T")
 
 WriteEvent = Callable[[str, dict[str, Any]], None]
+Begins = Callable[[str], None]
 
 
 class Judgement:
@@ -104,24 +105,26 @@ class Judgement:
             self._left, self._is_as_left = None, False
             self._finder = None  # it knows verdicts by what was asked before
 
-    def renew(self, source: Source, unless: int | None = None) -> Results | None:
+    def renew(self, source: Source, unless: int | None = None, begins: Begins = lambda step: None) -> Results | None:
         """Judge the map as it is, seen from that source; None when the engine is gone.
 
         The verdict in force is the answer while the map is still of version `unless`. Verdicts are reached one after
-        the other, so that map and regions of each are of one version.
+        the other, so that map and regions of each are of one version. `begins` hears of each step, see `awaited.STEPS`.
         """
         with self._judging:
-            return self._judge(source, unless)
+            return self._judge(source, unless, begins)
 
-    def _judge(self, source: Source, unless: int | None) -> Results | None:
+    def _judge(self, source: Source, unless: int | None, begins: Begins) -> Results | None:
         try:
             if unless is not None and self._map_version() == unless:
                 return self._results
+            begins("reading the map")
             with self._mirroring:
                 read_s = self._now_s()
                 self._mirror.catch_up(self._ask, self._ask_between)
                 snapshot, changed = self._mirror.changes()
-            report, coverage = self._found_again(snapshot, changed, source)
+            report, coverage = self._found_again(snapshot, changed, source, begins)
+            begins("following the regions")
             nominal = self._nominal
             found = conclude(snapshot, self._requirement, report, coverage, nominal.surface, nominal.refused)
             with self._in_force:
@@ -137,7 +140,9 @@ class Judgement:
             self._read_s = read_s
         return results
 
-    def _found_again(self, snapshot: MapSnapshot, changed: IntArray, source: Source) -> tuple[RegionReport, Coverage]:
+    def _found_again(
+        self, snapshot: MapSnapshot, changed: IntArray, source: Source, begins: Begins
+    ) -> tuple[RegionReport, Coverage]:
         """Regions and coverage of the map, of which these rows have changed; from nothing when it is seen otherwise."""
         towards = source.towards_sensor
         seen_from = _values_of(source.geometry), None if towards is None else tuple(towards.tolist())
@@ -146,7 +151,9 @@ class Judgement:
             self._coverage = CoverageBook()
             self._seen_from = seen_from
         try:
+            begins("looking for regions")
             report = self._finder.find(snapshot, changed)
+            begins("measuring coverage")
             return report, self._coverage.renew(snapshot, report, self._finder.renewed)
         except BaseException:
             self._finder = None  # what it knows is half renewed

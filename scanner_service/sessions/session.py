@@ -13,6 +13,7 @@ from drivers.scanline import Scanline
 from scanner_service.analysis.passes import PassKey
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.analyst import Analyst
+from scanner_service.sessions.awaited import AwaitedVerdict
 from scanner_service.sessions.calibration import CALIBRATED, calibration_of
 from scanner_service.sessions.chronicle import Chronicle
 from scanner_service.sessions.course import Course
@@ -62,6 +63,7 @@ class LiveSession:
             self.engine, self.verdicts, self.settings.requirement(), nominal, self._chronicle.event, clock
         )
         self.hearing = Hearing(self.engine, self._course, self._chronicle.event, self._stop_source, self._finish)
+        self._awaited = AwaitedVerdict(clock)
         self._closing = threading.Event()
         self._is_closing = False
         self._wires = Wires(source)
@@ -201,7 +203,8 @@ class LiveSession:
         self._judge_anew()
 
     def _judge_anew(self) -> None:
-        self._judge()
+        with self._awaited.awaited("asked_anew") as begins:
+            self._judgement.renew(self.source, begins=begins)
         if self._course.has_ended:  # what the scan left was of the verdict before
             self._judgement.write_regions_down()
 
@@ -301,7 +304,7 @@ class LiveSession:
 
     def fresh_results(self) -> Results:
         """A verdict on everything that was put in before this call."""
-        results = self._judge()
+        results = self._judgement.renew(self.source)
         if results is None:
             raise SessionError(self.engine.failure or "the session is closed")
         return results
@@ -345,6 +348,7 @@ class LiveSession:
             ),
             held=self._course.is_held,
             holds=results.holds if results is not None else None,
+            judging=self._awaited.told(),
         )
 
     # -- inside -------------------------------------------------------------------------------------------------
@@ -364,14 +368,15 @@ class LiveSession:
         An engine that was ended by a fault can do neither: then the session has failed, with what was judged before.
         """
         try:
-            self._course.wait_for_lines()
-            try:
-                self.engine.ask(lambda engine: engine.close_passes()).result()
-                # The account of a scan that is over is whole: the last commits are waited for, while there are any.
-                self.engine.ledger.wait_until_decided(0.0 if self._record.is_failing else _COMMIT_PATIENCE_S)
-            except SessionError as error:
-                failure = failure or str(error)
-            self._judge()
+            with self._awaited.awaited("scan_ended") as begins:
+                self._course.wait_for_lines()
+                try:
+                    self.engine.ask(lambda engine: engine.close_passes()).result()
+                    # The account of a scan that is over is whole: the last commits are waited for, while there are any.
+                    self.engine.ledger.wait_until_decided(0.0 if self._record.is_failing else _COMMIT_PATIENCE_S)
+                except SessionError as error:
+                    failure = failure or str(error)
+                self._judgement.renew(self.source, begins=begins)
             self._chronicle.event(SCAN_ENDED, self.losses())
             self._chronicle.ledger(self.losses(), self.elapsed_s())
             self._judgement.write_regions_down()
@@ -392,9 +397,6 @@ class LiveSession:
 
     def _judge_what_is_new(self) -> None:
         if self._course.is_under_way or self.results() is None:
-            results = self._judge(unless=self._judged_version)
+            results = self._judgement.renew(self.source, self._judged_version)
             if results is not None:
                 self._judged_version = results.snapshot.version
-
-    def _judge(self, unless: int | None = None) -> Results | None:
-        return self._judgement.renew(self.source, unless)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from scanner_service.sessions.awaited import Awaited
 from scanner_service.storage.rows import Watermark
 
 STATES = ("created", "scanning", "paused", "interrupted", "stopped", "failed")
@@ -16,7 +17,8 @@ class Status:
     `lines` and `points`: stored in the record, and counted in the map. `verdict_age_s`: how long ago the map was read
     that regions and coverage are of, NaN before the first verdict. `coverage_kind`: `observed`, of the
     surface seen, or `reference`, of the nominal part. `held`: a pause that lasts until somebody resumes.
-    `holds`: whether the coverage asked for is reached, None when none is asked for or none is known.
+    `holds`: whether the coverage asked for is reached, None when none is asked for or none is known. `judging`: the
+    verdict that is waited for, at the end of a scan or since something else is asked for; None when none is.
     """
 
     session_id: str
@@ -35,6 +37,7 @@ class Status:
     message: str | None
     held: bool
     holds: bool | None
+    judging: Awaited | None
 
 
 def durable_told(marks: Mapping[str, Watermark]) -> dict[str, dict[str, int]]:

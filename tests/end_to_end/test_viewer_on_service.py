@@ -93,7 +93,9 @@ def test_a_live_scan_never_shrinks_and_ends_as_the_service_has_it(running: Any, 
     states.append(page.text("#session-state"))  # the end may have come between the two looks
     assert seen == sorted(seen)
     assert seen[-1] > 0
-    assert list(dict.fromkeys(state for state in states if state)) in (["scanning", "stopped"], ["stopped"])
+    told = list(dict.fromkeys(state for state in states if state))
+    assert told == [state for state in ("scanning", "judging", "stopped") if state in told]
+    assert told[-1] == "stopped"
     assert page.text("#connection-text") == "Finished"
 
     known = points_of(service, session_id)
@@ -117,6 +119,17 @@ def test_a_live_scan_never_shrinks_and_ends_as_the_service_has_it(running: Any, 
     page.settle()
     for place in ((0.0, 8.0), (0.0, 34.0)):  # below and on the step
         assert_coloured_by_density(page, known, *place)
+
+    page.tab.click("#requirement-fold > summary")
+    page.tab.fill("#ask-density_per_mm2", "200")  # of all that was scanned: no region stays as it was
+    page.tab.click("#requirement-apply")
+    page.until("document.querySelector('#requirement-said').textContent.startsWith('200 points/mm²')")
+    page.until("viewer.regions > 0 && viewer.connection === 'finished'")
+    now = regions_of(service, session_id)
+    assert [int(number) for number in page.tab.locator("#regions .number").all_text_contents()] == [
+        one["id"] for one in now
+    ]
+    assert page.tab.locator("#regions .density").all_text_contents()[0].endswith("≥ 200points/mm²")
     assert page.complaints == []
     page.tab.close()
 
@@ -312,6 +325,7 @@ def test_what_is_asked_for_is_set_on_the_page_and_a_hand_is_guided_along_the_pas
     page.tab.fill("#ask-density_per_mm2", "24")
     page.tab.fill("#ask-coverage_share", "90")
     page.tab.click("#requirement-apply")
+    page.until("document.querySelector('#judging-text').textContent.match(/^Judged: [0-9]+ region.* scan, coverage /)")
     page.until("document.querySelector('#requirement-said').textContent.startsWith('24 points/mm² · coverage 90')")
     page.until("document.querySelector('#requirement-holds').dataset.holds === 'false'")
     page.until("viewer.regions > 0")

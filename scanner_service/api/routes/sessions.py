@@ -1,7 +1,7 @@
 """Sessions: create, list, start, pause, resume, stop, describe, delete; every call is one call of the session book."""
 
 import threading
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -126,6 +126,7 @@ def status_answer(session: LiveSession) -> dict[str, Any]:
         "can_pause": session.can_pause,
         "requirement": requirement_told(session.settings.target),
         "holds": status.holds,
+        "judging": None if status.judging is None else asdict(status.judging),
     }
 
 

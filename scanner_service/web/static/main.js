@@ -1,7 +1,6 @@
 // Puts the page together: which part is told what, and when; every rule lives in the part that it calls.
 
 import { FileBringer } from "./bringing.js";
-import { SCALES } from "./colours.js";
 import { byId, element } from "./element.js";
 import { ExportMenu } from "./exports.js";
 import { drawRuler, drawTriad } from "./gauges.js";
@@ -9,8 +8,10 @@ import { Guide } from "./guide.js";
 import { InterestBox } from "./interest_box.js";
 import { listenToKeys } from "./keyboard.js";
 import { drawLegend } from "./legend.js";
+import { Look } from "./look.js";
 import { opening as capitalised, whole, words } from "./numbers.js";
 import { drawFigures, drawInspector, drawLosses, drawRegions } from "./panels.js";
+import { JudgingNote } from "./judging_note.js";
 import { NominalPart } from "./nominal_part.js";
 import { PassArrow } from "./pass_arrow.js";
 import { PassesPanel } from "./passes_panel.js";
@@ -27,7 +28,6 @@ const TROUBLE_MS = 15000;
 const SURVEY_MS = 1000;
 const CLICK_SLACK_PX = 4;
 
-const look = { rule: "density", scale: "viridis", range: [0, 1], autoRange: true, pointScale: 1 };
 let chosenRegion = null;
 let inspectedRow = -1;
 let connectionState = "none";
@@ -43,6 +43,7 @@ const interest = new InterestBox();
 const marker = element("div.marker", { hidden: true, "aria-hidden": "true" });
 byId("view").append(marker);
 view.scene.add(cloud.object, overlay.group, interest.object);
+const look = new Look({ onChange: applyLook, measure: (range) => session.densityRange(range) });
 
 const arrow = new PassArrow();
 view.scene.add(arrow.object);
@@ -51,8 +52,13 @@ const guide = new Guide(byId("guide"), (share) => {
   view.invalidate();
 });
 const passes = new PassesPanel({ trouble, scanned: () => session.open(session.id), onOrder: followOrder, onPass: (pass) => showPass(pass ?? ordered?.pass ?? null) });
-const requirement = new RequirementPanel({ onInterest: showInterest, partBox });
-const nominal = new NominalPart();
+const judging = new JudgingNote(() => session.regions);
+const awaiting = {
+  onJudging: (told) => judging.status(told),
+  onJudged: () => connectionState === "finished" && session.open(session.id), // nothing more came by itself
+};
+const requirement = new RequirementPanel({ onInterest: showInterest, partBox, ...awaiting });
+const nominal = new NominalPart(awaiting);
 const exports = new ExportMenu(byId("export-links"), byId("exports"));
 const picker = new SessionPicker({ onChoose: openSession, onMissing: (text) => notice(text), current: () => session.id });
 new FileBringer({
@@ -95,12 +101,13 @@ function explainEmptiness() {
 function status() {
   const { status: told } = session;
   const state = byId("session-state");
+  const isEnding = told.judging?.why === "scan_ended";
   state.hidden = false;
-  state.textContent = words(told.state);
+  state.textContent = isEnding ? "judging" : words(told.state);
   state.dataset.state = told.state;
-  byId("stop").hidden = OVER.has(told.state) || told.state === "created";
+  byId("stop").hidden = OVER.has(told.state) || told.state === "created" || isEnding;
   byId("start").hidden = !session.startable;
-  byId("pause").hidden = told.state !== "scanning" || !told.can_pause;
+  byId("pause").hidden = told.state !== "scanning" || !told.can_pause || isEnding;
   byId("resume").hidden = told.state !== "paused" || !told.held;
   byId("start").textContent = told.state === "created" ? "Start" : "Go on";
   byId("stop-note").hidden = byId("stop").hidden;
@@ -112,6 +119,7 @@ function status() {
   say();
   drawFigures(byId("figures"), told, session.store, session.box);
   drawLosses(byId("losses"), byId("losses-count"), told.losses);
+  judging.status(told);
   requirement.status(told);
   nominal.status(told);
   passes.status(told);
@@ -128,6 +136,7 @@ function opening({ lines, of, progress: share }) {
 
 function regions() {
   const list = session.regions ?? [];
+  if (session.status) judging.status(session.status);
   overlay.show(list, session.origin, view.radius);
   overlay.choose(chosenRegion);
   drawRegions(byId("regions"), byId("regions-count"), session.regions, chosenRegion, chooseRegion, session.status);
@@ -224,7 +233,7 @@ function afterDraw() {
 
 function survey() {
   if (!session.survey()) return;
-  if (look.autoRange) look.range = session.densityRange(look.range);
+  look.survey();
   applyLook();
   if (session.box) view.setBox(session.box); // behind the legend's drawing: its size says where there is room
   drawFigures(byId("figures"), session.status, session.store, session.box);
@@ -232,11 +241,9 @@ function survey() {
 }
 
 function applyLook() {
-  cloud.rule = look.rule;
-  cloud.range = look.range;
+  [cloud.rule, cloud.scale, cloud.range] = [look.rule, look.scale, look.range];
   if (session.box) cloud.heightRange = [session.box.low[2], session.box.high[2]];
-  byId("scale-label").hidden = look.rule === "normals" || look.rule === "rescan";
-  if (look.autoRange) [byId("range-low").value, byId("range-high").value] = look.range;
+  look.show();
   legend();
   view.invalidate();
 }
@@ -260,9 +267,10 @@ function openSession(chosen) {
   inspect(-1);
   trouble("");
   view.touched = false;
-  look.range = look.autoRange ? [0, 1] : look.range;
+  look.begin();
   session.open(chosen.id);
   passes.open(chosen.id);
+  judging.open();
   requirement.open(chosen.id);
   nominal.open(chosen.id);
   explainEmptiness();
@@ -344,15 +352,6 @@ function listen() {
     const row = rowUnder(event);
     if (row >= 0) view.focus(session.store.xyz.slice(3 * row, 3 * row + 3));
   });
-  for (const [name, { text }] of Object.entries(SCALES)) byId("scale").append(element("option", { value: name }, text));
-  byId("rule").addEventListener("change", (event) => {
-    look.rule = event.target.value;
-    applyLook();
-  });
-  byId("scale").addEventListener("change", (event) => {
-    look.scale = cloud.scale = event.target.value;
-    applyLook();
-  });
   for (const button of document.querySelectorAll("[data-view]")) {
     button.addEventListener("click", () => (button.dataset.view === "fit" ? view.fit() : view.look(button.dataset.view)));
   }
@@ -364,29 +363,6 @@ function listen() {
     cloud.shaded = event.target.checked;
     view.invalidate();
   });
-  byId("point-size").addEventListener("input", (event) => {
-    look.pointScale = Number(event.target.value);
-    view.invalidate();
-  });
-  byId("range-auto").addEventListener("change", (event) => {
-    look.autoRange = event.target.checked;
-    byId("range-low").disabled = byId("range-high").disabled = look.autoRange;
-    if (look.autoRange) look.range = session.densityRange([-1, 0]);
-    applyLook();
-  });
-  for (const id of ["range-low", "range-high"]) {
-    byId(id).addEventListener("change", () => {
-      const [low, high] = [byId("range-low").valueAsNumber, byId("range-high").valueAsNumber];
-      const sound = low < high;
-      byId("range-high").setCustomValidity(sound ? "" : "must be larger than the lower end");
-      if (sound) {
-        look.range = [low, high];
-        applyLook();
-      } else {
-        byId("range-high").reportValidity();
-      }
-    });
-  }
   byId("start").addEventListener("click", (event) => command(event.currentTarget, startSession));
   byId("pause").addEventListener("click", (event) => command(event.currentTarget, pauseSession));
   byId("resume").addEventListener("click", (event) => command(event.currentTarget, resumeSession));

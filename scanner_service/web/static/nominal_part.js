@@ -1,12 +1,15 @@
 // The nominal part beside the form of what is asked for: brought as a mesh, and measured against; reads no byte of it.
 
 import { byId } from "./element.js";
-import { bringFile, measureAgainst } from "./service.js";
+import { bringFile, measureAgainst, whileJudged } from "./service.js";
 
 export class NominalPart {
   #id = null;
 
-  constructor() {
+  // onJudging(status) hears how far the verdict is that was asked for, onJudged() that it is there.
+  constructor({ onJudging, onJudged }) {
+    this.onJudging = onJudging;
+    this.onJudged = onJudged;
     byId("nominal-bring").addEventListener("click", () => byId("nominal-file").click());
     byId("nominal-file").addEventListener("change", (event) => {
       const [file] = event.target.files;
@@ -42,7 +45,8 @@ export class NominalPart {
     try {
       const name = await bring();
       this.#say(name === null ? "judging without it…" : `judging by ${name}…`);
-      await measureAgainst(id, name, byId("nominal-units").value);
+      await whileJudged(id, measureAgainst(id, name, byId("nominal-units").value), (told) => id === this.#id && this.onJudging(told));
+      if (id === this.#id) this.onJudged();
     } catch (refusal) {
       this.#refuse(refusal.message);
     } finally {

@@ -76,7 +76,7 @@ export function drawRegions(place, count, regions, chosen, onChoose, status = nu
         element("span.area", {}, significant(region.area_mm2), element("span.unit", {}, "mm²")),
         element("span.density", { title: limit.text }, `${significant(limit.measured)}, ${limit.bound === "at most" ? "≤" : "≥"} ${significant(limit.required)}`, element("span.unit", {}, limit.unit)),
         element("span.priority", {}, "priority ", significant(region.priority, 2)),
-        region.status ? element(`span.status.${region.status}`, { title: region.history?.at(-1)?.why ?? null }, region.status) : null,
+        region.status && region.status !== "open" ? element(`span.status.${region.status}`, { title: region.history?.at(-1)?.why ?? null }, region.status) : null,
         element("meter", { min: 0, max: 1, value: share, "aria-label": "how far what is required is met" }),
         region.remedy ? element("span.remedy", {}, region.remedy) : null,
       ),

@@ -89,6 +89,8 @@ export class PointCloud {
   }
 
   set scale(name) {
+    if (name === this.scaleName) return;
+    this.scaleName = name;
     this.material.uniforms.scale.value.dispose();
     this.material.uniforms.scale.value = scaleTexture(name);
   }

@@ -2,7 +2,7 @@
 
 import { byId, element } from "./element.js";
 import { AXES, CORNERS, FIELDS, inWords, presetOf, reached, refusalsByField, requestOf, textsOf } from "./requirement_form.js";
-import { askFor, listPresets } from "./service.js";
+import { askFor, listPresets, whileJudged } from "./service.js";
 
 const OWN = "";
 
@@ -13,10 +13,13 @@ export class RequirementPanel {
   #touched = false;
   #inputs = new Map();
 
-  // onInterest(box) hears of the box in the fields, {low_mm, high_mm} or null; partBox() tells how far the points reach.
-  constructor({ onInterest, partBox }) {
+  // onInterest(box) hears of the box in the fields, {low_mm, high_mm} or null; partBox() tells how far the points reach;
+  // onJudging(status) hears how far the verdict is that was asked for, onJudged() that it is there.
+  constructor({ onInterest, partBox, onJudging, onJudged }) {
     this.onInterest = onInterest;
     this.partBox = partBox;
+    this.onJudging = onJudging;
+    this.onJudged = onJudged;
     const form = byId("requirement-form");
     byId("requirement-fields").append(...FIELDS.map((field) => this.#field(field)));
     byId("interest-fields").append(...CORNERS.map((corner) => this.#corner(corner)));
@@ -132,10 +135,11 @@ export class RequirementPanel {
     apply.disabled = true;
     apply.textContent = "Judging…";
     try {
-      const { requirement } = await askFor(id, body);
+      const { requirement } = await whileJudged(id, askFor(id, body), (told) => id === this.#id && this.onJudging(told));
       if (id !== this.#id) return;
       this.#known = JSON.stringify(requirement);
       this.#fill(requirement);
+      this.onJudged();
     } catch (refusal) {
       if (id !== this.#id) return;
       this.#refuse(refusalsByField(refusal));

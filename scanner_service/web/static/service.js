@@ -64,6 +64,27 @@ export const listPresets = () => answer("api/v1/sessions/presets");
 // Ask for something else; answered when everything is judged anew: {requirement, holds, coverage}.
 export const askFor = (id, requirement) => send(sessionPath(id, "requirement"), requirement, "PUT");
 
+const LOOK_MS = 500;
+
+// What `request` answers; `onStatus` hears the session's status meanwhile and once more at its end, also where nothing is streamed any more.
+export async function whileJudged(id, request, onStatus) {
+  let isAnswered = false;
+  const look = () => answer(`api/v1/sessions/${encodeURIComponent(id)}`).then(onStatus, () => {});
+  const watch = async () => {
+    while (!isAnswered) {
+      await look();
+      await new Promise((resolve) => setTimeout(resolve, LOOK_MS));
+    }
+  };
+  watch();
+  try {
+    return await request;
+  } finally {
+    isAnswered = true;
+    await look();
+  }
+}
+
 // Measure coverage against a mesh in the service's folder, or against the surface seen when `file` is null.
 export const measureAgainst = (id, file, units) => (file === null ? answer(sessionPath(id, "reference"), { method: "DELETE" }) : send(sessionPath(id, "reference"), { file, units }, "PUT"));
 

@@ -119,6 +119,37 @@ def test_while_the_last_lines_wait_for_the_disk_nobody_else_does(book, disk, asi
     assert {reply.result(60).outcome for reply in replies} == {"stored"}
 
 
+def test_a_verdict_that_is_waited_for_is_told_until_it_is_there(book, disk, aside):
+    session = book.create("test", PushSpec(), SETTINGS)
+    session.start()
+    assert session.status().judging is None
+    session.push(LINES[0]).result(60)
+    stopping = aside(session.stop)
+    assert disk.is_waited_for.wait(60)
+    told = session.status().judging
+    assert (told.why, told.step, told.share) == ("scan_ended", "storing the last scanlines", 0.0)
+    disk.go_on.set()
+    stopping.result(60)
+    assert session.status().judging is None
+
+    steps, found = [], session._judgement._found_again
+
+    def watched(*of):
+        steps.append(session.status().judging)
+        answer = found(*of)
+        steps.append(session.status().judging)
+        return answer
+
+    session._judgement._found_again = watched
+    session.terms.judge_by(Requirement(density_per_mm2=90.0))
+    assert [(told.why, told.step) for told in steps] == [
+        ("asked_anew", "reading the map"),
+        ("asked_anew", "measuring coverage"),
+    ]
+    assert steps[0].share < steps[1].share < 1.0
+    assert session.status().judging is None
+
+
 def crossing(monkeypatch, record, verb):
     """The first call of a record's verb is kept between its answer and its caller; `done` lets it go."""
     reached, done, call = threading.Event(), threading.Event(), getattr(record, verb)
