@@ -108,7 +108,7 @@ def _pose(told: Mapping[str, Any]) -> Pose:
 
 def _told(line: Scanline) -> dict[str, Any]:
     """A scanline as REST takes it: a point without a return is null."""
-    seen = np.isfinite(line.points_mm).all(axis=1).tolist()
+    seen: list[bool] = np.isfinite(line.points_mm).all(axis=1).tolist()
     return {
         "device_id": line.device_id,
         "boot_id": line.boot_id,
