@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import httpx
 
+from scanner_service.commands.rescan import fate_of
 from scanner_service.commands.terminal import errors, fail
 
 if TYPE_CHECKING:
@@ -66,14 +67,8 @@ def _follow(client: httpx.Client, where: str, arm: "SimulatedArm") -> str:
 
 def _said(order: dict[str, Any]) -> str:
     """One pass and what became of it."""
-    one, outcome = order["pass"], order["outcome"]
-    said = f"pass {order['order']}, {one['lines']} lines {one['line_spacing_mm']:.2f} mm apart: "
-    if outcome is None:
-        return said + f"{order['status']}: {order['message']}"
-    said += f"promised {outcome['promised_mm2']:.0f} mm², reached {outcome['reached_mm2']:.0f} mm²"
-    if outcome["expected_mm2"] >= 1.0:
-        said += f"; explored: {outcome['found_mm2']:.0f} mm² found of {outcome['expected_mm2']:.0f} mm² expected"
-    return said
+    one = order["pass"]
+    return f"pass {order['order']}, {one['lines']} lines {one['line_spacing_mm']:.2f} mm apart: {fate_of(order)}"
 
 
 def _coverage(client: httpx.Client, where: str) -> str:

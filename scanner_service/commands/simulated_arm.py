@@ -108,14 +108,14 @@ def _pose(told: Mapping[str, Any]) -> Pose:
 
 def _told(line: Scanline) -> dict[str, Any]:
     """A scanline as REST takes it: a point without a return is null."""
-    seen: list[bool] = np.isfinite(line.points_mm).all(axis=1).tolist()
+    is_seen = np.isfinite(line.points_mm).all(axis=1)
     return {
         "device_id": line.device_id,
         "boot_id": line.boot_id,
         "pass_index": line.pass_index,
         "line_index": line.line_index,
         "device_time_s": line.device_time_s,
-        "points_mm": [point if is_seen else None for point, is_seen in zip(line.points_mm.tolist(), seen, strict=True)],
+        "points_mm": [point.tolist() if seen else None for point, seen in zip(line.points_mm, is_seen, strict=True)],
         "laser_mm": line.laser_mm.tolist(),
         "plane_normal": line.plane_normal.tolist(),
         "travel": line.travel.tolist(),
