@@ -234,7 +234,10 @@ def _known_device(kind: str, baud_rate: int | None) -> KnownDevice:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a simulated scanner as the command line says; the exit status."""
-    given = _parser().parse_args(arguments)
+    parser = _parser()
+    given = parser.parse_args(arguments)
+    if given.rig_file and not given.turntable:
+        parser.error("--rig-file puts a scanner and a turntable together: say --turntable too")
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())

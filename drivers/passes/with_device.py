@@ -52,7 +52,8 @@ def run_with_device(drive: PassDrive, scanner: NativeScanner) -> str:
         if drive.stopping.is_set() and not is_over:
             scanner.stop_pass()
         elif not is_over and drive.driven is not None:
-            silent_since_s = drive.clock() if profiles or not _rests(drive, drive.driven) else silent_since_s
+            if not _rests(drive, drive.driven) or profiles or not scanner.is_connected:
+                silent_since_s = drive.clock()
             if drive.clock() - silent_since_s > _SILENCE_S:
                 drive.told.event(
                     Advice("the stage rests, and the scanner still waits for places: check encoder, start and end")

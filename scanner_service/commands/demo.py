@@ -19,6 +19,7 @@ from scanner_service.api.keys import read_local_key
 from scanner_service.api.login import login_url
 from scanner_service.api.server import ServerThread
 from scanner_service.api.service import Service
+from scanner_service.commands.demo_loop import watch_loop
 from scanner_service.commands.terminal import (
     check_folder,
     console,
@@ -44,6 +45,9 @@ def demo_command(
     out: Annotated[Path, typer.Option(help="Folder for the result files.")] = Path("out"),
     part: Annotated[str, typer.Option(help="Part under the simulated scanner: demo, plate, step or sphere.")] = "demo",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the viewer; 0 takes a free one.")] = 0,
+    loop: Annotated[
+        bool, typer.Option("--loop", help="Scan coarsely, and watch the closed loop mend it with a simulated arm.")
+    ] = False,
     keep: Annotated[bool, typer.Option("--keep", help="Serve on after the scan, until Ctrl-C.")] = False,
     browse: Annotated[bool, typer.Option("--browse", help="Open the viewer in a browser.")] = False,
     seed: Annotated[int, typer.Option(help="Of noise and dropouts.")] = 1,
@@ -63,12 +67,14 @@ def demo_command(
         if browse:
             webbrowser.open(viewer)
         wait_until_ready(listening.url)
-        simulator = stack.enter_context(simulated_scanner(part, seed))
         key = read_local_key(Path(folder))
         client = stack.enter_context(
             httpx.Client(base_url=listening.url, headers={"Authorization": f"Bearer {key}"}, timeout=120.0)
         )
-        session_id = scan(client, part, simulator)
+        if loop:
+            session_id = watch_loop(client, part, seed)
+        else:
+            session_id = scan(client, part, stack.enter_context(simulated_scanner(part, seed)))
         for name in OUTPUT_FILES:
             (out / name).write_bytes(_checked(client.get(f"/api/v1/sessions/{session_id}/export/{name}")).content)
         summary = json.loads((out / "summary.json").read_text())

@@ -109,6 +109,11 @@ def _one(client: httpx.Client, where: str, number: int, plan: str, turned: bool,
 def _said(order: dict[str, Any]) -> str:
     one = order["pass"]
     head = f"{one['start_mm']:.1f} to {one['end_mm']:.1f} mm, lines {one['line_spacing_mm']:.3f} mm apart"
+    return f"{head}: {fate_of(order)}"
+
+
+def fate_of(order: dict[str, Any]) -> str:
+    """What became of an order, in words."""
     told = [order["status"]]
     if (outcome := order["outcome"]) is not None:
         promised = _area(outcome["promised_mm2"], outcome["promised_between_mm2"])
@@ -122,7 +127,7 @@ def _said(order: dict[str, Any]) -> str:
         told.append("ended before its end")
     if order["message"]:
         told.append(order["message"])
-    return f"{head}: {'; '.join(told)}"
+    return "; ".join(told)
 
 
 def _area(mm2: float, between_mm2: list[float] | None) -> str:

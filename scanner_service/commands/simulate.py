@@ -3,11 +3,14 @@
 import signal
 import threading
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json
+
+if TYPE_CHECKING:
+    from simulators.parts import Part
 
 
 def simulate_command(
@@ -15,6 +18,12 @@ def simulate_command(
         str, typer.Option(help="Kind of scanner: native (with a stage of its own), scip, lms200, rplidar or ls100.")
     ] = "native",
     part: Annotated[str, typer.Option(help="Part under the scanner: demo, plate, step or sphere.")] = "demo",
+    turntable: Annotated[
+        bool, typer.Option("--turntable", help="A part on a turntable, which has a port of its own.")
+    ] = False,
+    rig_file: Annotated[
+        Path | None, typer.Option(help="Write the rig file of scanner and turntable; with --turntable only.")
+    ] = None,
     mesh: Annotated[Path | None, typer.Option(help="A mesh instead: .stl, .obj or .ply.")] = None,
     scale: Annotated[float, typer.Option(help="Millimetres in one unit of the mesh.")] = 1.0,
     speed: Annotated[
@@ -36,10 +45,15 @@ def simulate_command(
         from simulators.parts import PARTS, mesh_part  # noqa: PLC0415
         from simulators.process import serve_simulated_scanner  # noqa: PLC0415
         from simulators.pty_port import SimulatedPortError  # noqa: PLC0415
+        from simulators.turntable import turned_part  # noqa: PLC0415
     except ImportError as error:
         fail(f"the simulator needs {error.name}: install scanner-service[simulation]")
     if mesh is None and part not in PARTS:
         fail(f"there is no part {part}; the parts are {', '.join(sorted(PARTS))}")
+    if rig_file is not None and not turntable:
+        fail("a rig file puts a scanner and a turntable together: say --turntable too")
+    if turntable and mesh is not None:
+        fail("on the turntable stands a part of its own: leave out --mesh or --turntable")
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
@@ -49,12 +63,19 @@ def simulate_command(
             show_json(event)
             return
         console.print(f"port: {event['port']}", highlight=False, soft_wrap=True)
+        if turntable:
+            console.print(f"turntable: {event['stage_port']}", highlight=False, soft_wrap=True)
         errors.print(f"{event['part']}, {event['baud_rate']} baud. Ctrl-C ends it.")
+
+    def subject() -> "Part":
+        if turntable:
+            return turned_part()
+        return mesh_part(mesh, scale) if mesh is not None else PARTS[part]()
 
     with plain_errors():
         try:
             serve_simulated_scanner(
-                mesh_part(mesh, scale) if mesh is not None else PARTS[part](),
+                subject(),
                 stop=stop,
                 announce=announce,
                 kind=device,
@@ -62,6 +83,8 @@ def simulate_command(
                 speed_mm_per_s=speed,
                 seed=seed,
                 link_path=link,
+                turntable=turntable,
+                rig_file=rig_file,
                 faults=Faults(bit_error_rate=flip_rate, byte_loss_rate=loss_rate),
             )
         except (SimulatedPortError, MeshError) as error:

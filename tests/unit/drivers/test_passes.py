@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drivers.errors import DriverError, StageStopped
+from drivers.errors import DriverError, StageNotConnected, StageStopped
 from drivers.passes.at_rest import run_at_rest
 from drivers.passes.in_motion import MotionPass
 from drivers.passes.stopping import Stopping
@@ -25,7 +25,7 @@ from drivers.scanline import Scanline
 from drivers.stages.setup import StageSetup
 from drivers.stages.unmoved import ConstantSpeed
 from scanner_service.sessions.rig_source import Preparation, RigSource
-from tests.unit.drivers.pass_bench import AT_REST, ORDER, BenchScanner, BenchStage, Workshop, bench
+from tests.unit.drivers.pass_bench import AT_REST, MOST_LOOKS, ORDER, BenchScanner, BenchStage, Workshop, bench
 
 PASSES = {
     "in motion": (ORDER, lambda drive: MotionPass(drive, drive.scanner).run()),
@@ -209,6 +209,18 @@ def test_a_wire_that_has_no_time_for_all_lines_slows_the_pass_down_or_is_told(sp
     run_with_device(drive, scanner)
     assert scanner.ordered[-1] == pytest.approx(rate_hz)
     assert [event.text for event in drive.told.take(0.0) if isinstance(event, Advice) and text in event.text]
+
+
+def test_a_scanner_that_waits_for_places_where_the_stage_will_not_come_is_not_waited_for():
+    shop, stage, scanner, drive = bench(by=PairBy.DEVICE)
+    scanner.skipped = range(10, MOST_LOOKS)  # its encoder has slipped: the stage rests, and places are missing
+    assert run_with_device(drive, scanner) == "stopped"
+    assert not scanner.laser_on
+    assert [event for event in drive.told.take(0.0) if isinstance(event, Advice) and "the stage rests" in event.text]
+    shop, stage, scanner, drive = bench(by=PairBy.DEVICE)
+    shop.at_look[10] = stage.unplug
+    with pytest.raises(StageNotConnected):
+        run_with_device(drive, scanner)
 
 
 def rig(makes_stage=BenchStage):

@@ -114,6 +114,23 @@ def test_the_first_line_of_a_pass_has_no_measured_step_and_counts_are_scaled() -
     ]
 
 
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_lines_are_measured_where_the_encoder_says_that_the_axis_is_however_late_somebody_looks(way: float) -> None:
+    axis_mm = [0.0]
+    device = new_device(encoder_mm_per_count=0.001, encoder_mm=lambda now_s: axis_mm[0])  # type: ignore[arg-type]
+    tell(device, Laser(1, True), 0.0)
+    device.receive(encode(Start(2, 100_000, 0, round(way * 1_000_000), 1_000_000)), 0.0)
+    seen = {}
+    for now_s, at_mm in ((0.1, 0.0), (0.2, 0.0), (0.3, 0.05), (0.31, 0.35), (0.4, 0.2), (0.41, 0.9995)):
+        device.receive(encode(Keepalive(9)), now_s)
+        axis_mm[0] = way * at_mm
+        lines = [item for item in hear(device, now_s) if isinstance(item, Chunk)]
+        seen[now_s] = sorted({round(line.position * way) for line in lines})
+        assert all(line.device_time_us == round(now_s * 1e6) for line in lines)
+    assert seen == {0.1: [0], 0.2: [], 0.3: [], 0.31: [100, 200, 300], 0.4: [], 0.41: [*range(400, 1001, 100)]}
+    assert device.status.end_reason is EndReason.REACHED_END  # the last one to a count
+
+
 @pytest.mark.parametrize(
     ("command", "result"),
     [
