@@ -108,7 +108,7 @@ def _pose(told: Mapping[str, Any]) -> Pose:
 
 def _told(line: Scanline) -> dict[str, Any]:
     """A scanline as REST takes it: a point without a return is null."""
-    is_seen = np.isfinite(line.points_mm).all(axis=1)
+    is_seen = np.asarray(np.isfinite(line.points_mm).all(axis=1))
     return {
         "device_id": line.device_id,
         "boot_id": line.boot_id,
