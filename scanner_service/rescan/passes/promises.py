@@ -15,7 +15,7 @@ Spreads = tuple[float, ...]
 """How far what a large pass brings of each kind lies from what was expected, by `Evidence`, as a share of that."""
 FIRST_SPREADS: Spreads = (0.05, 0.3, 0.2, 0.2, 1.0, 0.4, 1.0)
 """... before a pass has shown it."""
-GRAINS_MM2: tuple[float, ...] = (0.05, 2.0, 1.5, 0.5, 6.0, 6.0, 6.0)
+GRAINS_MM2: tuple[float, ...] = (0.05, 2.0, 3.0, 0.5, 6.0, 6.0, 6.0)
 """Surface comes in pieces of about this size, by `Evidence`: who asks for less may find all or nothing."""
 _IN_VAIN = 1.0  # so much less sure is a place that a pass was in vain for
 EIGHTY_PERCENT = 1.2816
