@@ -116,8 +116,9 @@ def fate_of(order: dict[str, Any]) -> str:
     """What became of an order, in words."""
     told = [order["status"]]
     if (outcome := order["outcome"]) is not None:
-        promised = _area(outcome["promised_mm2"], outcome["promised_between_mm2"])
-        told.append(f"promised {promised}, reached {outcome['reached_mm2']:.0f} mm²")
+        if outcome["promised_mm2"] >= 0.5 or outcome["expected_mm2"] < 1.0:
+            promised = _area(outcome["promised_mm2"], outcome["promised_between_mm2"])
+            told.append(f"promised {promised}, reached {outcome['reached_mm2']:.0f} mm²")
         if outcome["expected_mm2"] >= 1.0:
             expected = _area(outcome["expected_mm2"], outcome["expected_between_mm2"])
             told.append(f"explored: {outcome['found_mm2']:.0f} mm² found, {expected} expected")

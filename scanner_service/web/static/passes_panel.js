@@ -30,7 +30,7 @@ export function foretold({ promised_mm2, promised_between_mm2, explores_mm2, exp
 
 // What became of an order that is over, in words; "" while nothing has.
 export function fate({ status, message, outcome, reached_end: whole }) {
-  const said = outcome ? `promised ${area(outcome.promised_mm2, outcome.promised_between_mm2)}, reached ${significant(outcome.reached_mm2)} mm²` : "";
+  const said = outcome && !(outcome.promised_mm2 < 0.5 && outcome.expected_mm2 >= 1) ? `promised ${area(outcome.promised_mm2, outcome.promised_between_mm2)}, reached ${significant(outcome.reached_mm2)} mm²` : "";
   const explored = outcome?.expected_mm2 >= 1 ? `explored: ${significant(outcome.found_mm2)} found, ${area(outcome.expected_mm2, outcome.expected_between_mm2)} mm² expected` : "";
   const early = status === "done" && whole === false ? "ended before its end" : "";
   return [said, explored, early, message].filter(Boolean).join("; ");

@@ -71,5 +71,6 @@ test("a pass names its regions as the list does, an order what became of it", ()
   assert.equal(fate({ status: "done", message: null, outcome: { promised_mm2: 12, reached_mm2: 4 }, reached_end: false }), "promised 12, reached 4 mm²; ended before its end");
   const outcome = { promised_mm2: 12, promised_between_mm2: [8.04, 15], reached_mm2: 9, expected_mm2: 30, expected_between_mm2: [0, 81.3], found_mm2: 55 };
   assert.equal(fate({ status: "done", message: null, outcome, reached_end: true }), "promised 12 (8 to 15), reached 9 mm²; explored: 55 found, 30 (0 to 81) mm² expected");
+  assert.equal(fate({ status: "done", message: null, outcome: { ...outcome, promised_mm2: 0 }, reached_end: true }), "explored: 55 found, 30 (0 to 81) mm² expected");
   assert.equal(fate({ status: "failed", message: "the port is gone", outcome: null, reached_end: false }), "the port is gone");
 });
