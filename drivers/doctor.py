@@ -51,13 +51,15 @@ def check_machine(ports: Iterable[PortName] | None = None, processes: Path = Pat
     """Look at the adapters that are plugged in, and at programs known to meddle with them."""
     found_ports = list(list_ports() if ports is None else ports)
     findings = [finding for port in found_ports for finding in check_port(port)]
-    if not found_ports:
+    if all(port.is_built_in for port in found_ports):
+        own = "; a scanner on a port of the computer itself is found by `scanner devices --identify`"
         findings.append(
             Finding(
                 Level.WARNING,
                 "ports",
                 "no serial adapter is plugged in",
-                "plug it in; if it is, look at `dmesg` (a cable that only charges, too little power, no driver)",
+                "plug it in; if it is, look at `dmesg` (a cable that only charges, too little power, no driver)"
+                + (own if found_ports else ""),
             )
         )
     running = _running(processes)
@@ -79,6 +81,8 @@ def check_port(port: PortName) -> list[Finding]:
             return findings
     else:
         told = f"{port.product or port.driver or 'a serial port'}, can be opened"
+        if port.is_built_in:
+            told = "a serial port of the computer itself, which tells nothing of what is on it; can be opened"
         findings.append(Finding(Level.GOOD, port.path, f"{told}; name it {port.lasting}"))
     if port.latency_ms is not None and port.latency_ms > 1:
         findings.append(
@@ -90,7 +94,7 @@ def check_port(port: PortName) -> list[Finding]:
                 "latency_uncertainty_ms of the rig",
             )
         )
-    if port.lasting == port.path:
+    if port.lasting == port.path and not port.is_built_in:
         findings.append(
             Finding(
                 Level.WARNING,

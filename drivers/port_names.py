@@ -39,6 +39,11 @@ class PortName:
         return self.by_id or self.by_path or self.path
 
     @property
+    def is_built_in(self) -> bool:
+        """True for a port of the computer itself: its name stays, and nothing need be plugged in there."""
+        return not self.vendor and Path(self.path).name.startswith("ttyS")
+
+    @property
     def usb_name(self) -> str:
         """`usb:VID:PID[:SERIAL]`, empty for a port that is none of USB."""
         if not self.vendor:

@@ -12,6 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from scanner_service import __version__
+from scanner_service.commands.placeholders import put_placeholders
 
 COMMANDS = {
     "serve": "serve:serve_command",
@@ -50,10 +51,12 @@ class CommandsWhenAsked(TyperGroup):
         if not isinstance(found, typer.Typer):
             alone = typer.Typer(rich_markup_mode=None, pretty_exceptions_enable=False, add_completion=False)
             alone.command(cmd_name)(found)
-            return typer.main.get_command(alone)
-        group = typer.main.get_group(found)
-        group.name = cmd_name
-        return group
+            command = typer.main.get_command(alone)
+        else:
+            command = typer.main.get_group(found)
+            command.name = cmd_name
+        put_placeholders(command, cmd_name)
+        return command
 
 
 app = typer.Typer(

@@ -35,7 +35,8 @@ def line_rate(limits: RigLimits, order: PassOrder) -> float:
 def line_rate_of(profiles: Sequence[Profile]) -> float | None:
     """Return lines a second by the scanner's own clock, lines that are missing counted in; None of less than three.
 
-    It is that of the middle gap: one that a clock got wrong does not matter.
+    It is that of the middle gap: one that a clock got wrong does not matter. Of two gaps it is the longer one: a stage
+    that is too slow by a wrong clock scans finer than asked, one that is too fast would miss what was asked for.
     """
     gaps_s = sorted(
         (later.device_time_s - earlier.device_time_s) / (later.line_index - earlier.line_index)

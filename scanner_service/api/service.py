@@ -16,6 +16,7 @@ from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import SessionError
 from scanner_service.sessions.export_desk import ExportDesk
 from scanner_service.sessions.file_shelf import FileShelf
+from scanner_service.sessions.kernel_caches import mark_used
 from scanner_service.sessions.readiness import kernels_are_ready, warm_up
 from scanner_service.sessions.retention import Retention
 from scanner_service.storage.errors import RecordError, RecordUnusable
@@ -86,6 +87,7 @@ class Service:
     def _keep_to_the_retention(self) -> None:
         """The retention's thread: at the start, and every hour."""
         while True:
+            mark_used()  # of the kernels, which other programs may tidy up meanwhile
             try:
                 self.book.make_room_on_disk()
             except (SessionError, RecordError, TimeoutError) as error:

@@ -107,7 +107,11 @@ def analyse_command(
             summary["below_required"] = int(rescan.sum())
         write_points_ply(out / "points.ply", snapshot, rescan, version=__version__)
         drawing = importlib.import_module("scanner_service.storage.exports.density_png")  # 40 MB that no method needs
-        write_whole(out / "density.png", drawing.density_png(snapshot, session_name=file.name))
+        required = math.nan if density is None else density
+        write_whole(
+            out / "density.png",
+            drawing.density_png(snapshot, session_name=file.name, required_per_mm2=required),
+        )
         write_json(out / "regions.json", {"regions": [], "notes": [NO_REGIONS]})
         write_json(out / "summary.json", summary)
         if as_json:

@@ -29,7 +29,10 @@ def devices_command(
     """List the serial ports with the names that survive a replug and, if asked, who answers on them."""
     with plain_errors():
         ports = [_named(name) for name in port] if port else list_ports()
-        told = [{**asdict(item), "lasting": item.lasting, "usb_name": item.usb_name} for item in ports]
+        told = [
+            {**asdict(item), "lasting": item.lasting, "usb_name": item.usb_name, "is_built_in": item.is_built_in}
+            for item in ports
+        ]
         if identify_them:
             for item, entry in zip(ports, told, strict=True):
                 errors.print(f"asking {item.path} ...", highlight=False, soft_wrap=True)
@@ -46,10 +49,17 @@ def devices_command(
         ):
             table.add_column(column, overflow="fold")
         for entry in told:
-            adapter = " ".join(str(entry[key]) for key in ("product", "usb_name") if entry[key]) or str(entry["driver"])
+            adapter = " ".join(str(entry[key]) for key in ("product", "usb_name") if entry[key]) or (
+                "of the computer itself" if entry["is_built_in"] else str(entry["driver"])
+            )
             row = [str(entry["path"]), adapter, str(entry["lasting"])]
             table.add_row(*row, *([_shown(entry["device"])] if identify_them else []))
         console.print(table)
+
+
+def _told(port: PortName) -> dict[str, Any]:
+    names = {"lasting": port.lasting, "usb_name": port.usb_name, "is_built_in": port.is_built_in}
+    return asdict(port) | names
 
 
 def _named(name: str) -> PortName:

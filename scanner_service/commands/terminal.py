@@ -3,13 +3,14 @@
 import contextlib
 import json
 import math
+import os
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import httpx
 import typer
@@ -27,9 +28,22 @@ from scanner_service.storage.errors import RecordError
 from scanner_service.storage.exports.errors import ExportError
 from scanner_service.storage.formats.errors import FormatError
 
+_UNWRAPPED = 10_000
+
+
+def paper(stream: TextIO, environment: Mapping[str, str]) -> Console:
+    """A console on a terminal as wide as that is; in a file or a pipe nothing is wrapped or cut.
+
+    `COLUMNS` in the environment says how wide it is to be.
+    """
+    is_seen = stream.isatty() or "COLUMNS" in environment
+    return Console(file=None if stream in (sys.stdout, sys.stderr) else stream, stderr=stream is sys.stderr,
+                   width=None if is_seen else _UNWRAPPED, markup=False, emoji=False, _environ=environment)  # fmt: skip
+
+
 # What is told may hold brackets and colons: paths, names, extras of a package, usb:VID:PID.
-console = Console(markup=False, emoji=False)
-errors = Console(stderr=True, markup=False, emoji=False)
+console = paper(sys.stdout, os.environ)
+errors = paper(sys.stderr, os.environ)
 _MADE: ContextVar[tuple[Path, ...]] = ContextVar("folders that the command has made", default=())
 _UNWANTED = {"outside_pass", "between_stops", "before_start"}
 """Reasons of lines that a scanner made while its stage turned or went to the next stop: no loss."""

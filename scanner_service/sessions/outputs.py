@@ -58,6 +58,7 @@ def _density(path: Path, outcome: Outcome) -> None:
         session_name=outcome.row.name,
         when=outcome.row.created_utc[:16].replace("T", " ") + " UTC",
         coverage=outcome.results.share,
+        required_per_mm2=outcome.results.typical_required_per_mm2,
     )
     write_whole(path, picture)
 

@@ -6,6 +6,7 @@ import threading
 from scanner_service.analysis.compiling import compile_kernels
 from scanner_service.rescan.passes.compiling import compile_planner
 from scanner_service.rescan.requirement import Requirement
+from scanner_service.sessions.kernel_caches import mark_used, remove_unused
 from scanner_service.sessions.results import judge
 from scanner_service.storage.packing import compile_packing
 
@@ -26,8 +27,11 @@ def warm_up() -> None:
     """
     with _LOCK:
         if not _READY.is_set():
+            mark_used()
             compile_packing()
             snapshot = compile_kernels()
             compile_planner(snapshot, judge(snapshot, Requirement()).report)
+            mark_used()  # it may not have been there before
+            remove_unused()
             gc.freeze()
             _READY.set()

@@ -7,8 +7,6 @@ from datetime import datetime
 from functools import reduce
 from typing import Any
 
-import numpy as np
-
 from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.results import Results, summarise
@@ -20,6 +18,7 @@ from scanner_service.storage.exports.report_content import (
     PassRow,
     ReportContent,
     Verdictful,
+    amount,
     flat_rows,
     shown,
 )
@@ -28,8 +27,6 @@ from scanner_service.storage.exports.report_content import (
 def report_of(stored: StoredSession, now: datetime) -> ReportContent:
     """The content of the report of a session that was read with its stages."""
     results = stored.results
-    required = results.coverage.required_per_mm2
-    required = required[np.isfinite(required)]
     summary = summarise(results, stored.losses, math.nan, stored.about.version)
     regions = results.regions
     area = sum(region.area_mm2 for region in regions)
@@ -48,14 +45,14 @@ def report_of(stored: StoredSession, now: datetime) -> ReportContent:
         passes=tuple(_pass_row(number, stage) for number, stage in enumerate(stored.stages, start=1)),
         pass_ends=stored.pass_ends,
         fates=fates_of(stored.first, results) if stored.first is not None else (),
-        required_per_mm2=float(np.median(required)) if len(required) else math.nan,
+        required_per_mm2=results.typical_required_per_mm2,
         headlines=(
             *_nominal(results),
             ("observed coverage", _percent(share)),
             ("points", shown(summary["points"])),
             ("scanlines", shown(summary["scanlines"])),
             ("regions to scan again", shown(len(regions))),
-            ("their area", f"{area:,.0f} mm²"),
+            ("their area", f"{amount(area)} mm²"),
         ),
         facts=_facts(summary),
         losses=_losses(stored.losses),

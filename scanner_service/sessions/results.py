@@ -65,6 +65,12 @@ class Results:
         return "observed" if self.reference is None else "reference"
 
     @property
+    def typical_required_per_mm2(self) -> float:
+        """The median of what is required over the surface, points per mm²; NaN when nothing is known of it."""
+        known = self.coverage.required_per_mm2[np.isfinite(self.coverage.required_per_mm2)]
+        return float(np.median(known)) if len(known) else math.nan
+
+    @property
     def holds(self) -> bool | None:
         """Whether the coverage asked for is reached; None when none is asked for, or none is known."""
         asked = self.requirement.coverage_share

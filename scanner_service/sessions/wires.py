@@ -8,6 +8,9 @@ from drivers.tally import PassTally
 from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.source import OnAWire, Source
 
+_UNITS = ("_mm", "_s", "_hz", "_rad", "_deg", "_per_mm2", "_id", "_index")
+"""How names of figures end that are no counts."""
+
 
 @dataclass(frozen=True, slots=True)
 class Wires:
@@ -34,7 +37,10 @@ class Wires:
 
 
 def joined(earlier: Mapping[str, Any] | None, later: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Two accounts as one: counts are added, the smallest and largest stay so, any other figure is the later one's."""
+    """Two accounts as one: counts are added, the smallest and largest stay so, any other figure is the later one's.
+
+    A count is an integer whose name tells no unit: a spacing of 1 mm is none, though it may be written as one.
+    """
     if earlier is None or later is None:
         only = earlier if later is None else later
         return None if only is None else dict(only)
@@ -51,4 +57,4 @@ def _one(name: str, earlier: Any, later: Any) -> Any:
     if name.startswith("largest_"):
         return max(earlier, later)
     are_counts = all(isinstance(value, int) and not isinstance(value, bool) for value in (earlier, later))
-    return earlier + later if are_counts else later
+    return earlier + later if are_counts and not name.endswith(_UNITS) else later

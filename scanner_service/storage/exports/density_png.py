@@ -23,6 +23,7 @@ from matplotlib.patheffects import withStroke
 from drivers.scanline import Float64Array
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.storage.exports.density_raster import DensityRaster, View, judged, rasterise, view_along
+from scanner_service.storage.exports.density_scale import DensityScale, scale_of
 from scanner_service.storage.exports.label_places import label_places, pointed_at
 
 Colours = Literal["viridis", "blue-red"]
@@ -81,21 +82,22 @@ def density_figure(
     direction: Float64Array = _DOWN,
     colours: Colours = "viridis",
     dpi: int = 150,
-    top_per_mm2: float | None = None,
+    scale: DensityScale | None = None,
     lettered: bool = False,
 ) -> Figure:
     """Draw the density of the surface seen along `direction`; at most 11 inches wide and 8.25 high, at `dpi`.
 
-    The scale is absolute, in points per mm², from 0 to the 98th percentile of the judged points. Points that are not
-    reliable or not settled are grey. Regions are outlined with a line style for each reason, and numbered.
+    The scale is absolute, in points per mm², over most of the judged points, with what is required in the middle of the
+    colours. Points that are not reliable or not settled are grey. Regions are outlined with a line style for each
+    reason, and numbered.
 
     Parameters
     ----------
     coverage : share of the surface that meets the requirement, 0 to 1; NaN if unknown.
-    required_per_mm2 : marked on the scale; NaN if unknown.
+    required_per_mm2 : marked on the scale, and in the middle of its colours; NaN if unknown.
     direction : (3,) the way the eye looks, part frame; down z by default: x to the right, y up.
     colours : "viridis", or "blue-red" (blue dense, red sparse).
-    top_per_mm2 : end of the scale, so that two pictures can be compared; None takes it from the data.
+    scale : of two pictures that are to be compared; None takes it from the data.
     lettered : call regions A, B, … for 1, 2, …, beside another picture whose numbers are of other regions.
 
     Raises
@@ -109,14 +111,14 @@ def density_figure(
     figure = Figure(figsize=_size_inches(raster), dpi=dpi, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)  # makes itself the figure's canvas
     grid = figure.add_gridspec(1, 2, width_ratios=[1, 0.11])
-    part, scale = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
+    part, bar = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
     _title(figure, session_name, when, coverage, snapshot)
     _frame(part, view)
     colour_map: Colormap = _BLUE_RED if colours == "blue-red" else colormaps["viridis"]
     densities = snapshot.density_per_mm2[judged(snapshot)]
-    top = scale_top_per_mm2(snapshot, required_per_mm2) if top_per_mm2 is None else top_per_mm2
+    scale = scale_of(densities, required_per_mm2) if scale is None else scale
     if raster is not None:
-        _surface(part, raster, colour_map, top)
+        _surface(part, raster, colour_map, scale)
         shown = _outlines(part, regions, view)
         _labels(part, regions, view, letters_of if lettered else str)
         _legend(figure, raster, shown, regions)
@@ -125,9 +127,9 @@ def density_figure(
         part.set_xticks([])
         part.set_yticks([])
     if len(densities):
-        _scale(scale, densities, colour_map, top, required_per_mm2)
+        _bar(bar, densities, colour_map, scale, required_per_mm2)
     else:
-        scale.set_axis_off()  # a scale of which nothing has a colour
+        bar.set_axis_off()  # a scale of which nothing has a colour
     return figure
 
 
@@ -159,13 +161,6 @@ def density_png(
     picture = BytesIO()
     figure.savefig(picture, format="png", metadata={"Title": drawable(session_name), "Software": "scanner-service"})
     return picture.getvalue()
-
-
-def scale_top_per_mm2(snapshot: MapSnapshot, required_per_mm2: float = float("nan")) -> float:
-    """Where the scale of a picture of this map ends: at the 98th percentile, and not below the requirement."""
-    densities = snapshot.density_per_mm2[judged(snapshot)]
-    top = _rounded_up(float(np.percentile(densities, 98))) if len(densities) else 1.0
-    return max(top, _rounded_up(1.05 * required_per_mm2)) if np.isfinite(required_per_mm2) else top
 
 
 def _title(figure: Figure, session_name: str, when: str, coverage: float, snapshot: MapSnapshot) -> None:
@@ -202,8 +197,8 @@ def _axis_name(direction: Float64Array, otherwise: str) -> str:
     return ("" if direction[axis] > 0 else "-") + "xyz"[axis]
 
 
-def _surface(axes: Axes, raster: DensityRaster, colour_map: Colormap, top: float) -> None:
-    colours = colour_map(np.clip(np.nan_to_num(raster.density_per_mm2) / top, 0, 1))
+def _surface(axes: Axes, raster: DensityRaster, colour_map: Colormap, scale: DensityScale) -> None:
+    colours = colour_map(scale.share(np.nan_to_num(raster.density_per_mm2)))
     colours[np.isnan(raster.density_per_mm2)] = _rgba(_NOT_JUDGED)
     colours[~raster.seen] = 0
     left, right, bottom, upper = raster.extent_mm
@@ -313,36 +308,43 @@ def _legend(figure: Figure, raster: DensityRaster, shown: dict[str, int], region
     legend.get_title().set_color("#777777")
 
 
-def _scale(axes: Axes, densities: Float64Array, colour_map: Colormap, top: float, required: float) -> None:
+def _bar(axes: Axes, densities: Float64Array, colour_map: Colormap, scale: DensityScale, required: float) -> None:
     """The colour bar, and beside it how many points have which density."""
-    steps = np.linspace(0, 1, 256)
-    axes.imshow(colour_map(steps)[:, None], origin="lower", extent=(0, 0.35, 0, top), aspect="auto", zorder=2)
-    edges = np.linspace(0, top, 41)
-    share, _ = np.histogram(np.minimum(densities, top), edges)
+    bottom, top = scale.bottom, scale.top
+    steps = np.linspace(bottom, top, 512)
+    axes.imshow(
+        colour_map(scale.share(steps))[:, None], origin="lower", extent=(0, 0.35, bottom, top), aspect="auto", zorder=2
+    )
+    edges = np.linspace(bottom, top, 41)
+    share, _ = np.histogram(np.clip(densities, bottom, top), edges)
     if share.any():
         axes.barh(
             edges[:-1], 0.6 * share / share.max(), np.diff(edges), left=0.4, align="edge", color="#8a8a8a", zorder=2
         )
     if np.isfinite(required):
         axes.axhline(required, color="black", linewidth=1.4, path_effects=[withStroke(linewidth=3, foreground="white")])
-        axes.text(1.03, required, "required", fontsize=8, va="center", ha="left", color=_INK)
+        axes.text(1.06, required, f"required\n{required:.3g}", fontsize=8, va="center", ha="left", color=_INK)
+    for beyond, end, sign, side in ((densities < bottom, bottom, "≤", "top"), (densities > top, top, "≥", "bottom")):
+        if beyond.any():
+            axes.annotate(
+                f"{sign} {end:g}",
+                (0.175, end),
+                (0, -3 if side == "top" else 3),
+                textcoords="offset points",
+                fontsize=8,
+                ha="center",
+                va=side,
+                color=_INK,
+                annotation_clip=False,
+            )
     axes.set_xlim(0, 1.02)
-    axes.set_ylim(0, top)
+    axes.set_ylim(bottom, top)
     axes.set_xticks([])
     axes.set_ylabel("density (points/mm²), bars: how many points", color=_INK)
     axes.yaxis.set_label_position("left")
     axes.tick_params(colors="#555555", labelsize=9)
-    for side in axes.spines.values():
-        side.set_visible(False)
-
-
-def _rounded_up(value: float) -> float:
-    """The next number of two digits that is easy to read: 1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8 times a power of ten."""
-    if not (np.isfinite(value) and value > 0):
-        return 1.0
-    power = 10.0 ** np.floor(np.log10(value))
-    steps = np.array([1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10]) * power
-    return float(steps[steps >= value * (1 - 1e-12)][0])
+    for side_line in axes.spines.values():
+        side_line.set_visible(False)
 
 
 @cache

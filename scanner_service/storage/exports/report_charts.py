@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.storage.exports.density_raster import judged
-from scanner_service.storage.exports.report_content import PassRow
+from scanner_service.storage.exports.report_content import PassRow, amount
 
 _BAR, _SHORT, _INK, _LINE, _PAPER = "#3b6ea5", "#c2571a", "#222222", "#bbbbbb", "#ffffff"
 
@@ -38,7 +38,7 @@ def draw_histogram(axes: Axes, snapshot: MapSnapshot, required_per_mm2: float) -
     colours = [_SHORT if below else _BAR for below in short]
     axes.bar(edges[:-1], counts, np.diff(edges), align="edge", color=colours, edgecolor="white", linewidth=0.3)
     axes.set_xlim(0, top or 1.0)
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.0f}".replace(",", "\u202f"))
+    axes.yaxis.set_major_formatter(lambda value, _: amount(value))
     if np.isfinite(required_per_mm2):
         axes.axvline(required_per_mm2, color=_INK, linewidth=1.3, linestyle=(0, (5, 2)))
         axes.annotate(

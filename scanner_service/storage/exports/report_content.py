@@ -89,6 +89,11 @@ def flat_rows(values: Mapping[str, Any], before: str = "") -> list[tuple[str, st
     return rows
 
 
+def amount(value: float, digits: int = 0) -> str:
+    """A number with so many digits behind the point, its thousands apart as in all of the report."""
+    return f"{value:,.{digits}f}".replace(",", "\u202f")
+
+
 def shown(value: Any) -> str:
     """A value as people read it."""
     if value is None:
@@ -96,7 +101,7 @@ def shown(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
-        return f"{value:,}".replace(",", "\u202f")
+        return amount(value)
     if isinstance(value, float):
         return "unknown" if value != value else f"{value:.6g}"  # noqa: PLR0124 - NaN
     return str(value)

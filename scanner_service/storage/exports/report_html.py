@@ -5,9 +5,11 @@ from collections.abc import Iterable, Sequence
 from html import escape
 
 from scanner_service.rescan.region import Limit, RescanRegion
-from scanner_service.storage.exports.density_png import density_png, scale_top_per_mm2
+from scanner_service.storage.exports.density_png import density_png
+from scanner_service.storage.exports.density_raster import judged
+from scanner_service.storage.exports.density_scale import scale_of
 from scanner_service.storage.exports.report_charts import chart, draw_coverage, draw_histogram, svg_of
-from scanner_service.storage.exports.report_content import ReportContent, Verdictful, shown
+from scanner_service.storage.exports.report_content import ReportContent, Verdictful, amount, shown
 
 _PICTURE_DPI = 170
 MOST_REGIONS = 200
@@ -125,7 +127,9 @@ def map_png(content: ReportContent, found: Verdictful, dpi: int) -> bytes:
         session_name="",
         coverage=found.coverage.share,
         required_per_mm2=content.required_per_mm2,
-        top_per_mm2=scale_top_per_mm2(content.final.snapshot, content.required_per_mm2),
+        scale=scale_of(
+            content.final.snapshot.density_per_mm2[judged(content.final.snapshot)], content.required_per_mm2
+        ),
         dpi=dpi,
         lettered=found is content.first,
     )
@@ -159,8 +163,8 @@ def _passes(content: ReportContent) -> list[str]:
         parts.append(f"<p>{content.pass_ends} passes ended; {len(content.passes)} of them are shown.</p>")
     heads = ("after", "lines", "points", "coverage", "surface mm²", "gaps mm²", "regions", "to scan again mm²")
     rows = [
-        (row.name, shown(row.lines), shown(row.points), percent(row.coverage), f"{row.touched_mm2:,.0f}",
-         f"{row.gap_mm2:,.1f}", shown(row.regions), f"{row.region_mm2:,.1f}")
+        (row.name, shown(row.lines), shown(row.points), percent(row.coverage), amount(row.touched_mm2),
+         amount(row.gap_mm2, 1), shown(row.regions), amount(row.region_mm2, 1))
         for row in content.passes
     ]  # fmt: skip
     return [*parts, _table(heads, rows, numbers=range(1, 8))]
@@ -190,7 +194,7 @@ def _before(content: ReportContent) -> list[str]:
     if not content.fates:
         return [*parts, "<p>The first pass had left none.</p>"]
     rows = [
-        (fate.name, fate.reason, f"{fate.area_mm2:,.1f}", percent(fate.left_share), fate.outcome)
+        (fate.name, fate.reason, amount(fate.area_mm2, 1), percent(fate.left_share), fate.outcome)
         for fate in content.fates[:MOST_REGIONS]
     ]
     parts.append(_table(("in the map above", "reason", "area mm²", "still wanting", "outcome"), rows, numbers=(2, 3)))
@@ -206,7 +210,7 @@ def region_row(region: RescanRegion) -> tuple[str, ...]:
         str(told["number"]),
         str(told["reason"]).replace("_", " "),
         str(told["remedy"]),
-        f"{region.area_mm2:,.1f}",
+        amount(region.area_mm2, 1),
         limit.has,
         limit.needs,
         f"{region.priority:.2f}",

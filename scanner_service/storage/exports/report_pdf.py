@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
 from io import BytesIO
 
+import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_pdf import PdfPages
@@ -18,7 +20,7 @@ from matplotlib.text import Text
 
 from scanner_service.storage.exports.density_png import drawable
 from scanner_service.storage.exports.report_charts import draw_coverage, draw_histogram
-from scanner_service.storage.exports.report_content import ReportContent, Verdictful, shown
+from scanner_service.storage.exports.report_content import ReportContent, Verdictful, amount, shown
 from scanner_service.storage.exports.report_html import (
     AFTER,
     BEFORE,
@@ -31,16 +33,27 @@ from scanner_service.storage.exports.report_html import (
     region_row,
 )
 
+FloatArray = npt.NDArray[np.float32]
 _WIDTH, _HEIGHT = 8.27, 11.69  # A4 in inches
 _LEFT, _RIGHT, _TOP, _BOTTOM = 0.75, 7.6, 10.95, 0.8
 _INK, _SOFT, _LINE = "#1d232b", "#5b6572", "#d9dee4"
 _PICTURE_DPI = 220
 _POINT = 1 / 72
+_NEARLY_EMPTY = 0.35  # of a page
+_TIGHTER = (0.93, 0.87)  # closer than that the lines of a table can no longer be told apart
 
 
 def report_pdf(content: ReportContent) -> bytes:
-    """The whole report as a PDF."""
-    book = _Book(content)
+    """The whole report as a PDF; its lines move together where the last page would be nearly empty otherwise."""
+    pictures: dict[int, FloatArray] = {}
+    books = [_set(content, 1.0, pictures)]
+    if books[0].last_page_share < _NEARLY_EMPTY:
+        books += [_set(content, pitch, pictures) for pitch in _TIGHTER]
+    return min(books, key=lambda book: (book.page_count, -book.pitch)).to_bytes()
+
+
+def _set(content: ReportContent, pitch: float, pictures: dict[int, FloatArray]) -> "_Book":
+    book = _Book(content, pitch, pictures)
     book.title()
     book.figures()
     book.headline("Density")
@@ -64,17 +77,32 @@ def report_pdf(content: ReportContent) -> bytes:
         "", [("SHA-256 of the raw lines", content.raw_sha256), ("SHA-256 of the verdict", content.verdict_sha256)]
     )
     book.text(REPEATABLE)
-    return book.to_bytes()
+    return book
 
 
 class _Book:
-    """Pages with a cursor; `_y` is where the next thing goes, in inches from the bottom."""
+    """Pages with a cursor; `_y` is where the next thing goes, in inches from the bottom.
 
-    def __init__(self, content: ReportContent) -> None:
+    `pitch` is how far apart the lines of tables and lists are, 1 as a rule; `pictures` are those that were drawn.
+    """
+
+    def __init__(self, content: ReportContent, pitch: float, pictures: dict[int, FloatArray]) -> None:
+        self.pitch = pitch
+        self._pictures = pictures
         self._content = content
         self._pages: list[Figure] = []
         self._y = 0.0
         self._new_page()
+
+    @property
+    def page_count(self) -> int:
+        """How many pages there are."""
+        return len(self._pages)
+
+    @property
+    def last_page_share(self) -> float:
+        """How much of the last page is taken, 0 to 1."""
+        return (_TOP - self._y) / (_TOP - _BOTTOM)
 
     def title(self) -> None:
         """Name of the session, and which it is."""
@@ -115,7 +143,10 @@ class _Book:
 
     def map(self, found: Verdictful, caption: str, highest: float) -> None:
         """A density map, as wide as the page or as high as told."""
-        pixels = imread(BytesIO(map_png(self._content, found, _PICTURE_DPI)), format="png")
+        pixels = self._pictures.get(id(found))
+        if pixels is None:
+            pixels = imread(BytesIO(map_png(self._content, found, _PICTURE_DPI)), format="png")
+            self._pictures[id(found)] = pixels
         width = min(_RIGHT - _LEFT, highest * pixels.shape[1] / pixels.shape[0])
         height = width * pixels.shape[0] / pixels.shape[1]
         self._room(height + 0.3)
@@ -141,8 +172,8 @@ class _Book:
         self._table(
             (("after", 1.3, False), ("lines", 0.7, True), ("points", 0.9, True), ("coverage", 0.8, True),
              ("surface mm²", 0.95, True), ("gaps mm²", 0.8, True), ("regions", 0.6, True), ("again mm²", 0.8, True)),
-            [(row.name, shown(row.lines), shown(row.points), percent(row.coverage), f"{row.touched_mm2:,.0f}",
-              f"{row.gap_mm2:,.1f}", shown(row.regions), f"{row.region_mm2:,.1f}") for row in content.passes],
+            [(row.name, shown(row.lines), shown(row.points), percent(row.coverage), amount(row.touched_mm2),
+              amount(row.gap_mm2, 1), shown(row.regions), amount(row.region_mm2, 1)) for row in content.passes],
         )  # fmt: skip
 
     def regions(self) -> None:
@@ -152,8 +183,8 @@ class _Book:
             self.text("None: what was seen meets the requirement.")
             return
         self._table(
-            (("#", 0.35, True), ("reason", 0.85, False), ("remedy", 1.65, False), ("area mm²", 0.75, True),
-             ("measured", 0.8, True), ("required", 0.8, True), ("priority", 0.6, True), ("at x, y, z mm", 1.05, True)),
+            (("#", 0.35, True), ("reason", 0.8, False), ("remedy", 1.35, False), ("area mm²", 0.75, True),
+             ("measured", 0.8, True), ("required", 0.8, True), ("priority", 0.6, True), ("at x, y, z mm", 1.4, True)),
             [region_row(region) for region in regions[:MOST_REGIONS]],
         )  # fmt: skip
         if len(regions) > MOST_REGIONS:
@@ -175,7 +206,7 @@ class _Book:
         self._table(
             (("in the map", 0.8, False), ("reason", 1.4, False), ("area mm²", 1.1, True), ("still wanting", 1.1, True),
              ("outcome", 1.6, False)),
-            [(fate.name, fate.reason, f"{fate.area_mm2:,.1f}", percent(fate.left_share), fate.outcome)
+            [(fate.name, fate.reason, amount(fate.area_mm2, 1), percent(fate.left_share), fate.outcome)
              for fate in content.fates[:MOST_REGIONS]],
         )  # fmt: skip
 
@@ -187,12 +218,12 @@ class _Book:
             self._put(name, 9.5, bold=True)
         for left, right in rows:
             lines = textwrap.wrap(drawable(right), 58) or [""]
-            self._room(0.17 * len(lines) + 0.05)
+            self._room(0.17 * self.pitch * len(lines) + 0.05)
             for number, line in enumerate(lines):
                 if number == 0:
                     self._at(_LEFT, self._y - 0.13, left, 8, _SOFT)
                 self._at(_LEFT + 2.6, self._y - 0.13, line, 8)
-                self._y -= 0.17
+                self._y -= 0.17 * self.pitch
             self._line(_LEFT, self._y - 0.02, _RIGHT, self._y - 0.02, _LINE, 0.5)
         self._y -= 0.06
 
@@ -242,7 +273,7 @@ class _Book:
                 for text, (_, width, _) in zip(row, columns, strict=True)
             ]
             height = max(len(lines) for lines in wrapped)
-            if self._y - 0.16 * height - 0.05 < _BOTTOM:
+            if self._y - 0.16 * self.pitch * height - 0.05 < _BOTTOM:
                 self._new_page()
                 self._cells(columns, [name for name, _, _ in columns], head=True)
             for number in range(height):
@@ -257,7 +288,7 @@ class _Book:
             place = x + width - 0.12 if is_number else x
             self._at(place, self._y - 0.13, text, 7.8, _INK, "right" if is_number else "left", bold=head)
             x += width
-        self._y -= 0.16
+        self._y -= 0.16 * self.pitch
         if head:
             self._line(_LEFT, self._y - 0.02, _RIGHT, self._y - 0.02, _INK, 0.9)
             self._y -= 0.03

@@ -88,3 +88,15 @@ def test_a_machine_without_adapters_and_with_meddling_programs_is_told(tmp_path:
     assert [finding.about for finding in findings] == ["ports", "ModemManager"]
     assert all(finding.level is Level.WARNING and finding.remedy for finding in findings)
     assert list_ports(tmp_path / "none", tmp_path / "none", tmp_path) == []
+
+
+def test_a_port_of_the_computer_itself_is_no_adapter_and_needs_no_other_name(tmp_path: Path) -> None:
+    own, adapter = PortName("/dev/ttyS0", driver="port"), PortName("/dev/ttyUSB0", vendor="0403", driver="ftdi_sio")
+    assert [port.is_built_in for port in (own, adapter)] == [True, False]
+    said = check_machine([own], tmp_path)
+    assert not any("survives a replug" in item.found for item in said)
+    (about_adapters,) = (item for item in said if "no serial adapter is plugged in" in item.found)
+    assert "a port of the computer itself" in about_adapters.remedy
+    both = check_machine([own, adapter], tmp_path)
+    assert not any("no serial adapter" in item.found for item in both)
+    assert [item.about for item in both if "survives a replug" in item.found] == ["/dev/ttyUSB0"]

@@ -17,9 +17,9 @@ from scanner_service.sessions.reporting import fates_of, report_of
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
 from scanner_service.sessions.stored import find_session, read_session
-from scanner_service.storage.exports.report_content import FateRow, flat_rows, shown
+from scanner_service.storage.exports.report_content import FateRow, amount, flat_rows, shown
 from scanner_service.storage.exports.report_html import report_html
-from scanner_service.storage.exports.report_pdf import report_pdf
+from scanner_service.storage.exports.report_pdf import _set, report_pdf
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
 from tests.unit.analysis.scans import surface_scan
@@ -118,19 +118,50 @@ def text_of_pdf(pdf, tmp_path):
     return done.stdout.decode("utf-8")
 
 
-def test_html_and_pdf_say_the_same_figures(content, tmp_path):
+def test_html_and_pdf_say_the_same_figures_with_their_thousands_apart(content, tmp_path):
+    passes = [
+        replace(row, lines=12345, touched_mm2=23456.7, gap_mm2=3456.78, region_mm2=4567.89) for row in content.passes
+    ]
+    content = replace(
+        content, passes=tuple(passes), fates=tuple(replace(fate, area_mm2=5678.9) for fate in content.fates)
+    )
     html = unescape(re.sub(r"<[^>]*>", " ", report_html(content).decode("utf-8")))
     pdf = text_of_pdf(report_pdf(content), tmp_path)
     wanted = [content.session_id, content.raw_sha256[:40], content.verdict_sha256[:40], content.software]
     wanted += [value for _, value in content.headlines]
-    wanted += [f"{row.region_mm2:,.1f}" for row in content.passes] + [fate.outcome for fate in content.fates]
+    wanted += [amount(row.region_mm2, 1) for row in content.passes] + [fate.outcome for fate in content.fates]
+    wanted += ["12 345", "23 457", "3 456.8", "5 678.9"]
     wanted += ["Losses", "Before and after", "Settings", "uncertainty", "0.1 mm", "5 °", "received"]
+    assert not re.search(r"\d,\d{3}", re.sub(r"<(style|svg).*?</\1>", "", html, flags=re.DOTALL) + pdf)
     html, pdf = ("".join(text.split()) for text in (html, pdf))
     for text in wanted:
         assert "".join(text.split()) in html, text
         assert "".join(text.split()) in pdf, text
 
 
+@pytest.fixture
+def coarse(monkeypatch):
+    """Pictures of few pixels, for tests that look at the pages only."""
+    monkeypatch.setattr("scanner_service.storage.exports.report_pdf._PICTURE_DPI", 30)
+
+
+@pytest.mark.usefixtures("coarse")
+def test_no_page_is_spent_on_a_few_lines(content):
+    """Rows are added until the last page is just begun; set closer they then fit on the pages before."""
+    pictures, settings = {}, content.settings
+    loose = _set(content, 1.0, pictures)
+    for _ in range(2):  # up to the end of the page, and over it
+        left = int((1.02 - loose.last_page_share) * 10.15 / 0.17)
+        settings = (*settings, *((f"setting {n}", "0") for n in range(left)))
+        loose = _set(replace(content, settings=settings), 1.0, pictures)
+        if loose.last_page_share < 0.3:
+            break
+    assert loose.last_page_share < 0.3
+    pdf = report_pdf(replace(content, settings=settings))
+    assert len(re.findall(rb"/Type /Page\b", pdf)) == loose.page_count - 1
+
+
+@pytest.mark.usefixtures("coarse")
 def test_a_pdf_of_many_regions_goes_over_pages_that_are_numbered(content, tmp_path):
     many = replace(content.final.report, regions=content.final.report.regions * 90 or ())
     if not many.regions:

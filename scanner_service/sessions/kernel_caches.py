@@ -1,0 +1,70 @@
+"""Caches of compiled kernels beside this program's own: those of other sources that nobody used lately are removed.
+
+Each state of the sources has a folder of its own (see `analysis`), which would stay for ever otherwise. A program marks
+its own as used by the folder's time, at its start and now and then; knows no kernel.
+"""
+
+import logging
+import os
+import re
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from numba import config
+
+_LOG = logging.getLogger(__name__)
+UNUSED_S = 30 * 24 * 3600.0
+"""A cache that was not used for so long is removed."""
+
+_CACHE = re.compile(r"kernels-[0-9a-f]{16}")
+_GOING = re.compile(r"kernels-[0-9a-f]{16}\.going-\d+")
+
+
+def mark_used(own: Path | None = None) -> None:
+    """Say that a cache is in use, this program's own by default; one that is not there is none."""
+    try:
+        os.utime(own or Path(config.CACHE_DIR))
+    except FileNotFoundError:  # nothing was compiled yet
+        return
+    except OSError as error:
+        _LOG.warning("the cache of kernels %s cannot be marked as used: %s", own or config.CACHE_DIR, error)
+
+
+def remove_unused(own: Path | None = None, now_s: Callable[[], float] = time.time) -> list[str]:
+    """Remove the caches beside `own`, this program's by default, that were last used more than `UNUSED_S` ago.
+
+    Returns the names of those that are gone; what cannot be removed is said in the log. Several programs may do so at
+    once: a cache is given another name first, which one of them alone can do.
+    """
+    own = own or Path(config.CACHE_DIR)
+    if not _CACHE.fullmatch(own.name):
+        return []  # a folder of the user's: what lies beside it is none of our business
+    try:
+        beside = [each for each in own.parent.iterdir() if each.name != own.name]
+    except OSError:
+        return []
+    return [each.name for each in beside if _is_unused(each, now_s()) and _remove(each)]
+
+
+def _is_unused(folder: Path, now_s: float) -> bool:
+    if not (_CACHE.fullmatch(folder.name) or _GOING.fullmatch(folder.name)):
+        return False
+    try:
+        return not folder.is_symlink() and folder.is_dir() and now_s - folder.stat().st_mtime > UNUSED_S
+    except OSError:  # another program was faster
+        return False
+
+
+def _remove(folder: Path) -> bool:
+    going = folder if _GOING.fullmatch(folder.name) else folder.with_name(f"{folder.name}.going-{os.getpid()}")
+    try:
+        folder.rename(going)
+        shutil.rmtree(going)
+    except FileNotFoundError:  # another program was faster
+        return False
+    except OSError as error:
+        _LOG.warning("the unused cache of kernels %s cannot be removed: %s", going, error)
+        return False
+    return True
