@@ -7,6 +7,7 @@ import numpy as np
 
 from drivers.scanline import Pose
 from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.rescan.passes.behind import weighed
 from scanner_service.rescan.passes.cover import Choice, Cover
 from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.looks import Look
@@ -32,8 +33,9 @@ from scanner_service.rescan.region import RescanRegion
 from scanner_service.rescan.regions import RegionReport
 from scanner_service.rescan.requirement import Requirement
 
-MAX_NEEDS = 4_000
+MAX_NEEDS = 6_000
 """More places than this are thinned at random, each that is left standing for more area."""
+_EVEN = 0.2  # so much of the mean worth is added to each: what is worth little is told as out of reach all the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +96,7 @@ def plan_passes(
     needs, given_up = (tried or Tried.nothing()).of(needs, surface.cell_mm)
     needs = _thinned(needs)
     sky = look_around(surface, needs.places_mm, needs.normals, optics.max_camera_rad)
+    needs = weighed(surface, needs, sky, reach.may_light(sky.directions))
     cover = Cover(surface, needs, sky, reach, optics)
     passes: list[RecommendedPass] = []
     while len(passes) < wishes.max_passes:
@@ -110,13 +113,19 @@ def plan_passes(
 
 
 def _thinned(needs: Needs) -> Needs:
+    """MAX_NEEDS of them, drawn by what each is worth, so that a draw stands for the same gain as all."""
     if len(needs) <= MAX_NEEDS:
         return needs
+    worth = needs.gain_mm2 + _EVEN * float(needs.gain_mm2.mean())
+    share = np.minimum(1.0, worth * (MAX_NEEDS / float(worth.sum())))
+    for _ in range(4):  # what is sure to stay leaves room for more of the rest
+        rest = share < 1.0
+        room = MAX_NEEDS - float(np.count_nonzero(~rest))
+        share[rest] = np.minimum(1.0, worth[rest] * (room / float(worth[rest].sum())))
     rng = np.random.default_rng(len(needs))  # the same needs give the same plan
-    keep = np.zeros(len(needs), dtype=np.bool_)
-    keep[rng.permutation(len(needs))[:MAX_NEEDS]] = True
+    keep = np.diff(np.floor(np.cumsum(share) + rng.random()), prepend=0.0) > 0
     fewer = needs.only(keep)
-    return fewer.changed(area_mm2=fewer.area_mm2 * (float(needs.area_mm2.sum()) / float(fewer.area_mm2.sum())))
+    return fewer.changed(area_mm2=fewer.area_mm2 / share[keep])
 
 
 def _recommend(

@@ -1,0 +1,111 @@
+"""What lies behind the border of hidden space, seen from where it is faced best; knows no passes.
+
+Hidden space that a look would leave again after a short way is the rest of a shadow, and rarely begins with surface;
+where known surface stops the way, or where it goes on for long, the part is in it.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from drivers.scanline import BoolArray, Float64Array
+from scanner_service.rescan.passes.known_surface import KnownSurface
+from scanner_service.rescan.passes.marching import HIDDEN, SURFACE
+from scanner_service.rescan.passes.needs import HIDDEN_KINDS, Evidence, Needs
+from scanner_service.rescan.passes.visibility import OpenSky
+
+WEIGHED_KINDS = (Evidence.BEYOND, Evidence.FAR, Evidence.REST)
+"""Hidden space that is explored; beside known surface it begins with surface whatever lies behind."""
+
+_ASKEW, _FACED = 0.5, 0.9  # cosine at which the rig faces hidden space best: little of it is seen, or all
+_LEAST_FACED = 0.25
+_ONE_WAY = 0.1  # length of the mean of directions that go somewhere
+_AWAY, _ACROSS = -0.275, -0.05  # cosine to where the rig lights from: a border faces away from it, and not any more
+_LEAST_AWAY, _LEAST_BESIDE = 0.1, 0.3  # ... then this little is left of it, and beside known surface
+
+THIN_MM = 4.5
+"""A way through the margin below the outermost points is up to this long, and no surface is in it."""
+THICK_MM = 8.0
+"""From this way on hidden space is as likely to begin with surface as it ever is without known surface behind."""
+_RESTS = 0.1
+_DEEP = 0.7
+_ROUGH = 2.0  # cells: where hidden space begins is rough by so much
+
+
+def weighed(surface: KnownSurface, needs: Needs, sky: OpenSky, may_light: BoolArray) -> Needs:
+    """The needs, hidden space with less chance where there is little behind.
+
+    Parameters
+    ----------
+    sky : the open sky of each need.
+    may_light : (d,) from which of the sky's directions the rig can light the part.
+    """
+    hidden = np.isin(needs.evidence, HIDDEN_KINDS)
+    hidden &= surface.state.reshape(-1)[surface.keys(needs.places_mm)] == HIDDEN
+    rows = np.flatnonzero(hidden)
+    if not len(rows) or not may_light.any():
+        return needs
+    facing = needs.normals[rows] @ sky.directions.T
+    facing[~(sky.open[rows] & may_light)] = -1.0
+    best = facing.argmax(axis=1)
+    lit = facing[np.arange(len(rows)), best] > 0
+    rows, best = rows[lit], best[lit]
+    length, stopped = ways_behind(surface, needs.places_mm[rows], -sky.directions[best])
+    share = np.clip((length - THIN_MM) / (THICK_MM - THIN_MM), 0.0, 1.0)
+    chance = needs.chance.copy()
+    explored = np.isin(needs.evidence[rows], WEIGHED_KINDS)
+    chance[rows] *= np.where(explored & ~stopped, _RESTS + (_DEEP - _RESTS) * share, 1.0)
+    chance[rows] *= _between(facing[lit, best], _ASKEW, _FACED, _LEAST_FACED)
+    away = needs.normals[rows] @ _middle(sky.directions[may_light])
+    least = np.where(explored, _LEAST_AWAY, _LEAST_BESIDE)
+    chance[rows] *= np.where(stopped, 1.0, np.maximum(_between(away, _AWAY, _ACROSS, 0.0), least))
+    return needs.changed(chance=chance)
+
+
+def _middle(directions: Float64Array) -> Float64Array:
+    """The middle (3,) of unit directions (d, 3); of length 0 when they point everywhere."""
+    mean = directions.mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    return np.asarray(mean / length if length > _ONE_WAY else np.zeros(3), dtype=np.float64)
+
+
+def _between(value: Float64Array, low: float, high: float, least: float) -> Float64Array:
+    """(n,) rising from `least` at `low` to 1 at `high`."""
+    return np.asarray(least + (1.0 - least) * np.clip((value - low) / (high - low), 0.0, 1.0), dtype=np.float64)
+
+
+def ways_behind(surface: KnownSurface, places_mm: Float64Array, ways: Float64Array) -> tuple[Float64Array, BoolArray]:
+    """How far hidden space goes on behind places (n, 3) along unit `ways` (n, 3): mm (n,), and whether the back of known
+    surface (True), or its front, empty space and the end of the grid (False) ends it (n,).
+    """
+    length, stopped = np.zeros(len(places_mm)), np.zeros(len(places_mm), dtype=np.bool_)
+    grid = (surface.state, surface.row, surface.normals, surface.two_sided, surface.low_mm, surface.cell_mm)
+    _follow(*grid, places_mm, ways, length, stopped)
+    return length, stopped
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _follow(state, index, normals, two_sided, low, cell, places, ways, length, stopped):
+    ni, nj, nk = state.shape
+    longest = 2.0 * cell * (ni + nj + nk)
+    for n in range(len(places)):
+        gone = 0.0
+        while gone < longest:
+            i = math.floor((places[n, 0] + gone * ways[n, 0] - low[0]) / cell)
+            j = math.floor((places[n, 1] + gone * ways[n, 1] - low[1]) / cell)
+            k = math.floor((places[n, 2] + gone * ways[n, 2] - low[2]) / cell)
+            if i < 0 or j < 0 or k < 0 or i >= ni or j >= nj or k >= nk:
+                break
+            if gone > _ROUGH * cell and state[i, j, k] == SURFACE:
+                row = index[i, j, k]
+                if row < 0 or two_sided[row]:
+                    stopped[n] = True
+                else:
+                    facing = normals[row, 0] * ways[n, 0] + normals[row, 1] * ways[n, 1] + normals[row, 2] * ways[n, 2]
+                    stopped[n] = facing > 0
+                break
+            if gone > _ROUGH * cell and state[i, j, k] < HIDDEN:
+                break
+            gone += 0.5 * cell
+        length[n] = gone
