@@ -4,15 +4,13 @@ Hidden space that a look would leave again after a short way is the rest of a sh
 where known surface stops the way, or where it goes on for long, the part is in it.
 """
 
-import math
-
 import numpy as np
-from numba import njit
 
 from drivers.scanline import BoolArray, Float64Array
 from scanner_service.rescan.passes.known_surface import KnownSurface
-from scanner_service.rescan.passes.marching import HIDDEN, SURFACE
+from scanner_service.rescan.passes.marching import HIDDEN
 from scanner_service.rescan.passes.needs import HIDDEN_KINDS, Evidence, Needs
+from scanner_service.rescan.passes.sights import follow_hidden
 from scanner_service.rescan.passes.visibility import OpenSky
 
 WEIGHED_KINDS = (Evidence.BEYOND, Evidence.FAR, Evidence.REST)
@@ -30,7 +28,6 @@ THICK_MM = 8.0
 """From this way on hidden space is as likely to begin with surface as it ever is without known surface behind."""
 _RESTS = 0.1
 _DEEP = 0.7
-_ROUGH = 2.0  # cells: where hidden space begins is rough by so much
 
 
 def weighed(surface: KnownSurface, needs: Needs, sky: OpenSky, may_light: BoolArray) -> Needs:
@@ -76,36 +73,11 @@ def _between(value: Float64Array, low: float, high: float, least: float) -> Floa
 
 
 def ways_behind(surface: KnownSurface, places_mm: Float64Array, ways: Float64Array) -> tuple[Float64Array, BoolArray]:
-    """How far hidden space goes on behind places (n, 3) along unit `ways` (n, 3): mm (n,), and whether the back of known
-    surface (True), or its front, empty space and the end of the grid (False) ends it (n,).
+    """How far hidden space goes on behind places (n, 3) along unit `ways` (n, 3): mm (n,), and what ends it (n,).
+
+    True: the back of known surface, so that the part lies between. False: its front, empty space, the end of the grid.
     """
     length, stopped = np.zeros(len(places_mm)), np.zeros(len(places_mm), dtype=np.bool_)
     grid = (surface.state, surface.row, surface.normals, surface.two_sided, surface.low_mm, surface.cell_mm)
-    _follow(*grid, places_mm, ways, length, stopped)
+    follow_hidden(*grid, places_mm, ways, length, stopped)
     return length, stopped
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _follow(state, index, normals, two_sided, low, cell, places, ways, length, stopped):
-    ni, nj, nk = state.shape
-    longest = 2.0 * cell * (ni + nj + nk)
-    for n in range(len(places)):
-        gone = 0.0
-        while gone < longest:
-            i = math.floor((places[n, 0] + gone * ways[n, 0] - low[0]) / cell)
-            j = math.floor((places[n, 1] + gone * ways[n, 1] - low[1]) / cell)
-            k = math.floor((places[n, 2] + gone * ways[n, 2] - low[2]) / cell)
-            if i < 0 or j < 0 or k < 0 or i >= ni or j >= nj or k >= nk:
-                break
-            if gone > _ROUGH * cell and state[i, j, k] == SURFACE:
-                row = index[i, j, k]
-                if row < 0 or two_sided[row]:
-                    stopped[n] = True
-                else:
-                    facing = normals[row, 0] * ways[n, 0] + normals[row, 1] * ways[n, 1] + normals[row, 2] * ways[n, 2]
-                    stopped[n] = facing > 0
-                break
-            if gone > _ROUGH * cell and state[i, j, k] < HIDDEN:
-                break
-            gone += 0.5 * cell
-        length[n] = gone

@@ -226,8 +226,8 @@ def _normals(
 def _nothing() -> KnownSurface:
     none, flat = np.zeros((0, 3)), np.zeros(0)
     whole = np.zeros(0, dtype=np.int64)
+    state, row = np.zeros((1, 1, 1), dtype=np.uint8), np.full((1, 1, 1), -1, dtype=np.int32)
     return KnownSurface(
-        np.zeros(3), LEAST_CELL_MM, np.zeros((1, 1, 1), dtype=np.uint8), np.full((1, 1, 1), -1, dtype=np.int32), none, none.copy(), flat, whole, flat.copy(),
-        whole.copy(), np.zeros(0, dtype=np.bool_), none.copy(), none.copy(), flat.copy(),
-        flat.copy(), flat.copy(),
+        np.zeros(3), LEAST_CELL_MM, state, row, none, none.copy(), flat, whole, flat.copy(), whole.copy(),
+        np.zeros(0, dtype=np.bool_), none.copy(), none.copy(), flat.copy(), flat.copy(), flat.copy(),
     )  # fmt: skip

@@ -97,11 +97,11 @@ def plan_passes(
     needs = _thinned(needs)
     sky = look_around(surface, needs.places_mm, needs.normals, optics.max_camera_rad)
     needs = weighed(surface, needs, sky, reach.may_light(sky.directions))
-    cover = Cover(surface, needs, sky, reach, optics)
+    cover = Cover(surface, needs, sky, reach, optics, wishes.least_gain_mm2)
     passes: list[RecommendedPass] = []
     while len(passes) < wishes.max_passes:
         choice = cover.next(standing)
-        if choice is None or choice.stretch.gain_mm2 < wishes.least_gain_mm2:
+        if choice is None:
             break
         one = _recommend(len(passes) + 1, choice, needs, reach, standing, wishes)
         passes.append(one)

@@ -9,16 +9,20 @@ import math
 import numpy as np
 from numba import njit
 
-from scanner_service.rescan.passes.marching import HIDDEN
+from scanner_service.rescan.passes.marching import HIDDEN, SURFACE
 
 CLEAR = 3.0
-"""Cells that a sight goes before anything is in its way: beside an inner edge the other wall begins that near."""
+"""Cells that a sight goes before anything is in its way: beside an inner edge the other wall begins that near, and
+where hidden space begins is rough."""
 
-LIFT = 1.5
-"""Cells above its place from which a sight begins: where hidden space begins is rough."""
+LIFT = 0.5
+"""Cells above its place from which a sight begins."""
 
-BENEATH = 0.4
-"""Cells that a sight may go beneath the plane of a cell's points: they are noisy, and an edge is rounded by its mean."""
+BENEATH = 0.5
+"""Cells that a sight may go beneath the plane of a cell's points: they are noisy, and their mean rounds an edge."""
+
+ROUGH = 2.0
+"""Cells within which hidden space may be left and entered again: where it begins is rough."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -103,3 +107,30 @@ def clear_sights(state, index, points, facing, low, cell, places, normals, targe
             out[n] = not _is_hidden(
                 state, index, points, facing, low, cell, x, y, z, dx, dy, dz, clear, length
             )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def follow_hidden(state, index, normals, two_sided, low, cell, places, ways, length, stopped):
+    """How far hidden space goes on from places (n, 3) along their ways; whether the back of known surface ends it."""
+    ni, nj, nk = state.shape
+    longest = 2.0 * cell * (ni + nj + nk)
+    for n in range(len(places)):
+        gone = 0.0
+        while gone < longest:
+            i = math.floor((places[n, 0] + gone * ways[n, 0] - low[0]) / cell)
+            j = math.floor((places[n, 1] + gone * ways[n, 1] - low[1]) / cell)
+            k = math.floor((places[n, 2] + gone * ways[n, 2] - low[2]) / cell)
+            if i < 0 or j < 0 or k < 0 or i >= ni or j >= nj or k >= nk:
+                break
+            if gone > ROUGH * cell and state[i, j, k] == SURFACE:
+                row = index[i, j, k]
+                if row < 0 or two_sided[row]:
+                    stopped[n] = True
+                else:
+                    facing = normals[row, 0] * ways[n, 0] + normals[row, 1] * ways[n, 1] + normals[row, 2] * ways[n, 2]
+                    stopped[n] = facing > 0
+                break
+            if gone > ROUGH * cell and state[i, j, k] < HIDDEN:
+                break
+            gone += 0.5 * cell
+        length[n] = gone
