@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from benchmarks.rescan_scan import (
     subject_of,
 )
 from drivers.scanline import Float64Array, Pose
+from scanner_service.analysis.live_map import LiveMap
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.experience import experience_of
 from scanner_service.rescan.passes.looks import look_of
@@ -30,10 +32,12 @@ from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.passes.reach import Reach
 from scanner_service.rescan.passes.recommendation import Plan, RecommendedPass
 from scanner_service.rescan.passes.tried import Tried
-from scanner_service.rescan.regions import RegionReport, find_regions
+from scanner_service.rescan.regions import RegionFinder, RegionReport
 from scanner_service.rescan.requirement import Requirement
+from scanner_service.sessions.mirror import Mirror
 from simulators.optics import LaserLineScanner, demo_scanner
 
+T = TypeVar("T")
 FIRST_SPACING_MM = 0.35
 RASTER_SPACINGS_MM = (0.35, 0.28, 0.22, 0.17, 0.12)
 GOAL = 0.99
@@ -44,7 +48,7 @@ LEAST_MM2 = 1.0
 """What promises less promises nothing: a plan recommends no pass that brings less."""
 LOST = 2.1
 """Other ways are followed until they took this many times as long as the loop in all."""
-MAX_PASSES = 40
+MAX_PASSES = 120
 
 
 def first_pass(scan: Scan, subject: Subject, scanner: LaserLineScanner) -> None:
@@ -97,8 +101,9 @@ def largest_hole_first(subject: Subject, reach: Reach, scanner: LaserLineScanner
     scan.run.way = "largest hole first"
     first_pass(scan, subject, scanner)
     tried: list[Float64Array] = []
+    judge = Judge(scan, scanner)
     for _ in range(MAX_PASSES):
-        _, report = judged(scan, scanner)
+        _, report = judge.judged()
         regions = [
             region
             for region in sorted(report.regions, key=lambda one: -one.area_mm2)
@@ -128,11 +133,24 @@ def _stands_still(run: Run) -> bool:
     return len(run.coverage) > STILL_PASSES and run.coverage[-1] - run.coverage[-1 - STILL_PASSES] < STILL_SHARE
 
 
-def judged(scan: Scan, scanner: LaserLineScanner) -> tuple[MapSnapshot, RegionReport]:
-    """The map and what is wrong with it."""
-    assert scan.map is not None
-    snapshot = scan.map.snapshot()
-    return snapshot, find_regions(snapshot, Requirement(density_per_mm2=DENSITY_PER_MM2), scanner.geometry())
+class Judge:
+    """The map of a scan and what is wrong with it, judged again where it has changed, as the service does."""
+
+    def __init__(self, scan: Scan, scanner: LaserLineScanner) -> None:
+        if scan.map is None:
+            raise ValueError("only a scan with a map can be judged")
+        self._map = scan.map
+        self._mirror = Mirror()
+        self._finder = RegionFinder(Requirement(density_per_mm2=DENSITY_PER_MM2), scanner.geometry())
+
+    def judged(self) -> tuple[MapSnapshot, RegionReport]:
+        """Now."""
+        self._mirror.catch_up(self._ask, self._ask)
+        snapshot, changed = self._mirror.changes()
+        return snapshot, self._finder.find(snapshot, changed)
+
+    def _ask(self, question: Callable[[LiveMap], T], /) -> T:
+        return question(self._map)
 
 
 def closed_loop(
@@ -145,7 +163,8 @@ def closed_loop(
     optics = ScannerOptics(scanner.geometry(), scanner.field_of_view_mm, scanner.points_per_line)
     earlier: list[Outcome] = []
     tried = Tried.nothing()
-    snapshot, report = judged(scan, scanner)
+    judge = Judge(scan, scanner)
+    snapshot, report = judge.judged()
     plan: Plan | None = None
     for _ in range(MAX_PASSES):
         wishes = Wishes(DENSITY_PER_MM2, max_passes=1, learned=experience_of(earlier))
@@ -160,7 +179,7 @@ def closed_loop(
         before = scan.truth.met_mm2
         scan.drive(chosen.motion.part_from_sensor, chosen.start_mm, chosen.end_mm, chosen.line_spacing_mm)
         was, was_report = snapshot, report
-        snapshot, report = judged(scan, scanner)
+        snapshot, report = judge.judged()
         outcome: Outcome = reckon(chosen, was, was_report, snapshot, report, optics)
         tried = tried.and_also(outcome.missed_mm, outcome.empty_mm)
         earlier.append(outcome)

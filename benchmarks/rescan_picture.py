@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.rescan_loop import first_pass, judged
+from benchmarks.rescan_loop import Judge, first_pass
 from benchmarks.rescan_scan import DENSITY_PER_MM2, Scan, Subject, reach_of
 from drivers.scanline import Float64Array
 from scanner_service.rescan.passes.known_surface import know_surface
@@ -37,7 +37,7 @@ def draw(path: Path) -> None:
     )  # fmt: skip
     scan = Scan(subject, reach, scanner, with_map=True)
     first_pass(scan, subject, scanner)
-    snapshot, report = judged(scan, scanner)
+    snapshot, report = Judge(scan, scanner).judged()
     optics = ScannerOptics(scanner.geometry(), scanner.field_of_view_mm, scanner.points_per_line)
     surface = know_surface(snapshot, *failing_points(report))
     needs = find_needs(snapshot, report, surface, Wanted(DENSITY_PER_MM2))

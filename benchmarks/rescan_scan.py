@@ -4,9 +4,11 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks.rescan_parts import drawn
 from benchmarks.scannable import Allowed, CoverageTruth, sample_surface, scannable
 from drivers.rig_limits import AxisKind, RigLimits
 from drivers.scanline import Float64Array, Pose, Scanline
@@ -23,6 +25,7 @@ from simulators.shapes import Surface
 DENSITY_PER_MM2 = 20.0
 MESHES = (("fandisk.obj", 30.0), ("gears.stl", 1.0), ("featuretype.STL", 10.0))
 """Each about 50 mm long, as the demo part is."""
+DRAWN = "drawn-"
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +95,17 @@ class Scan:
 
 
 def subject_of(name: str, scanner: LaserLineScanner, max_tilt_rad: float, meshes: Path | None) -> Subject:
-    """A generated part by its name, or a mesh file, with its truth worked out once."""
+    """A generated part by its name, one drawn by chance as `drawn-SEED`, or a mesh file; its truth worked out once."""
+    surface: Surface
     scales = dict(MESHES)
-    if name in PARTS:
+    if name.startswith(DRAWN):
+        with TemporaryDirectory() as folder:
+            drawn(int(name.removeprefix(DRAWN))).export(Path(folder) / f"{name}.stl")
+            surface = mesh = load_mesh(Path(folder) / f"{name}.stl", 1.0)
+        low, high = mesh.bounds_mm
+    elif name in PARTS:
         part: Part = PARTS[name]()
-        surface: Surface = part.surface
+        surface = part.surface
         low, high = np.array([-24.0, -1.0, -7.0]), np.array([24.0, 61.0, 20.0])
     else:
         if meshes is None:

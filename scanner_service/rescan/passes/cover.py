@@ -51,8 +51,17 @@ class Candidate:
 class Cover:
     """The search for passes over one set of needs; what was chosen takes its gain away from the rest."""
 
-    def __init__(self, surface: KnownSurface, needs: Needs, sky: OpenSky, reach: Reach, optics: ScannerOptics) -> None:
+    def __init__(
+        self,
+        surface: KnownSurface,
+        needs: Needs,
+        sky: OpenSky,
+        reach: Reach,
+        optics: ScannerOptics,
+        least_mm2: float = 0.0,
+    ) -> None:
         self._surface, self._needs, self._sky, self._reach, self._optics = surface, needs, sky, reach, optics
+        self._least_mm2 = least_mm2
         self._middle_mm = surface.points_mm.mean(axis=0) if len(surface.points_mm) else np.zeros(3)
         self.attitudes = reach.attitudes(self._middle_mm)
         self.left_mm2 = needs.gain_mm2.copy()
@@ -60,7 +69,7 @@ class Cover:
         self.reachable: BoolArray = np.asarray(self._visible.any(axis=0))
 
     def next(self, standing: Pose | None) -> Choice | None:
-        """The best pass for what is left; None when nothing is."""
+        """The best pass for what is left that brings enough; None when there is none."""
         ranked: list[Candidate] = []
         for number in self._promising(standing):
             ranked += self._rough(self.attitudes[number], self._visible[number], standing)
@@ -145,7 +154,7 @@ class Cover:
             way = self._reach.seconds_between(standing, motion.part_from_sensor(float(local[lane, 1].mean())))
             stretch = best_stretch(
                 local[lane, 1], coarsest[lane], gain[lane], self._reach.line_spacing_mm, _ENDLESS,
-                self._reach.seconds_each, way,
+                self._reach.seconds_each, way, self._least_mm2,
             )  # fmt: skip
             if stretch is not None:
                 found.append(Candidate(attitude, motion, stretch.gain_per_s))
@@ -163,6 +172,7 @@ class Cover:
         stretch = best_stretch(
             prospect.position_mm, prospect.coarsest_mm, self.left_mm2, self._reach.line_spacing_mm,
             _ENDLESS if is_free else self._travel, self._reach.seconds_each, way,
+            self._least_mm2,
         )  # fmt: skip
         if stretch is None:
             return None

@@ -34,6 +34,8 @@ LEAST_CELL_MM = 0.35
 _LINES_IN_A_CELL = 1.3  # so that a surface at the coarsest line spacing leaves no cell empty
 _ONE_SIDED = 0.6  # length of the mean normal below which the normals of a cell point both ways
 _FACING = 8.0  # hidden space that is thinner than this tells of no surface; a plane boundary gives 25
+_TURNED = 0.6  # what is taken off a border's leaning towards the lasers: see `_behind_edges`
+_SHADOWED = 0.8  # cosine to the lasers up to which a border is the side of a shadow, not one that faces them
 _MARGIN_MM = 1.5  # how far beyond the outermost points hidden surface is reckoned with: the next pass sees further
 
 
@@ -41,7 +43,8 @@ _MARGIN_MM = 1.5  # how far beyond the outermost points hidden surface is reckon
 class KnownSurface:
     """What is known of a part, in cells of side `cell_mm` from the corner `low_mm` (3,), part frame.
 
-    `state` (i, j, k) is UNTOUCHED, FREE, HIDDEN or SURFACE as in `marching`. One row a cell with points:
+    `state` (i, j, k) is UNTOUCHED, FREE, HIDDEN or SURFACE as in `marching`, `row` (i, j, k) the row of a cell with
+    points, -1 without. One row a cell with points:
     `points_mm`, `normals` (m, 3; unit, towards the laser), `area_mm2`, `count`, `failing_share` (m,) and `region` (m,),
     the number that failing points gave (0: none); `two_sided` (m,) where both sides of a thin wall were seen.
     `frontier_mm`, `frontier_normals` (f, 3) and `frontier_mm2` (f,) are where hidden space begins: surface that no
@@ -52,6 +55,7 @@ class KnownSurface:
     low_mm: Float64Array
     cell_mm: float
     state: npt.NDArray[np.uint8]
+    row: npt.NDArray[np.int32]
     points_mm: Float64Array
     normals: Float64Array
     area_mm2: Float64Array
@@ -136,10 +140,12 @@ def know_surface(
     solid, emptied = np.zeros(len(open_cells)), np.zeros(len(open_cells))
     share_around(state >= HIDDEN, open_cells, solid)
     share_around(freed, open_cells, emptied)
+    border, middle = low + (open_cells + 0.5) * side, np.asarray(lines.laser_mm.mean(axis=0))
     return KnownSurface(
         low_mm=low,
         cell_mm=side,
         state=state,
+        row=index,
         points_mm=places,
         normals=normals,
         area_mm2=area,
@@ -147,8 +153,8 @@ def know_surface(
         failing_share=sums[:, 7] / sums[:, 6],
         region=sums[:, 8].astype(np.int64),
         two_sided=np.linalg.norm(sums[:, 3:6], axis=1) < _ONE_SIDED * sums[:, 9],
-        frontier_mm=low + (open_cells + 0.5) * side,
-        frontier_normals=gradient,
+        frontier_mm=border,
+        frontier_normals=_behind_edges(border, gradient, middle),
         frontier_mm2=side * side / np.maximum(np.abs(gradient).max(axis=1, initial=0.5), 0.5),
         frontier_solid=solid,
         frontier_emptied=emptied,
@@ -164,6 +170,24 @@ def _frontier(state: npt.NDArray[np.uint8]) -> tuple[IntArray, Float64Array]:
     length = np.linalg.norm(gradient, axis=1)
     sure = length > _FACING
     return cells[sure], gradient[sure] / length[sure, None]
+
+
+def _behind_edges(border_mm: Float64Array, facing: Float64Array, lasers_mm: Float64Array) -> Float64Array:
+    """How the surface behind a border of hidden space (f, 3) probably faces, when the border itself faces so (f, 3).
+
+    The side of a shadow lies along the rays that pass its edge. Whatever surface begins at that edge was not seen by
+    them: it is turned further away from the lasers, and is mostly a wall that stands up to them.
+    """
+    towards = _towards(border_mm, lasers_mm)
+    cosine = np.einsum("ij,ij->i", facing, towards)
+    leaning = np.where((cosine > 0) & (cosine < _SHADOWED), _TURNED * cosine, 0.0)
+    turned = facing - leaning[:, None] * towards
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True), dtype=np.float64)
+
+
+def _towards(places_mm: Float64Array, lasers_mm: Float64Array) -> Float64Array:
+    way = lasers_mm - places_mm
+    return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True), dtype=np.float64)
 
 
 def _cell_side(snapshot: MapSnapshot, low: Float64Array, high: Float64Array) -> float:
@@ -192,8 +216,7 @@ def _normals(
     if len(without):
         gradient = np.zeros((len(without), 3))
         outward(state, np.floor((places[without] - low) / side).astype(np.int64), gradient)
-        towards = lasers.mean(axis=0) - places[without]
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        towards = _towards(places[without], lasers.mean(axis=0))
         size = np.linalg.norm(gradient, axis=1)
         normals[without] = np.where(size[:, None] > 1.0, gradient, towards)
         length[without] = np.linalg.norm(normals[without], axis=1)
@@ -203,8 +226,8 @@ def _normals(
 def _nothing() -> KnownSurface:
     none, flat = np.zeros((0, 3)), np.zeros(0)
     whole = np.zeros(0, dtype=np.int64)
+    state, row = np.zeros((1, 1, 1), dtype=np.uint8), np.full((1, 1, 1), -1, dtype=np.int32)
     return KnownSurface(
-        np.zeros(3), LEAST_CELL_MM, np.zeros((1, 1, 1), dtype=np.uint8), none, none.copy(), flat, whole, flat.copy(),
-        whole.copy(), np.zeros(0, dtype=np.bool_), none.copy(), none.copy(), flat.copy(),
-        flat.copy(), flat.copy(),
+        np.zeros(3), LEAST_CELL_MM, state, row, none, none.copy(), flat, whole, flat.copy(), whole.copy(),
+        np.zeros(0, dtype=np.bool_), none.copy(), none.copy(), flat.copy(), flat.copy(), flat.copy(),
     )  # fmt: skip

@@ -6,9 +6,6 @@ import numpy as np
 from numba import njit
 
 UNTOUCHED, FREE, HIDDEN, SURFACE = 0, 1, 2, 3
-CLEAR = 1.6
-"""Cells that a sight goes before anything is in its way: beside an inner edge the other wall begins that near."""
-
 AIR = 2
 """So many cells around a point must rays have gone through before it hangs in the air."""
 
@@ -239,35 +236,3 @@ def open_faces(state, out):
                     out[count, 0], out[count, 1], out[count, 2] = i, j, k
                     count += 1
     return count
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def clear_ways(state, low, cell, places, normals, directions, least_cosine, out):
-    """Whether each place (n, 3) sees far along each direction (d, 3); False below `least_cosine` to its normal."""
-    for n in range(len(places)):
-        for d in range(len(directions)):
-            dx, dy, dz = directions[d, 0], directions[d, 1], directions[d, 2]
-            cosine = dx * normals[n, 0] + dy * normals[n, 1] + dz * normals[n, 2]
-            out[n, d] = False
-            if cosine >= least_cosine:
-                lift = 1.5 * cell
-                x, y, z = (places[n, 0] + lift * normals[n, 0], places[n, 1] + lift * normals[n, 1],
-                           places[n, 2] + lift * normals[n, 2])  # fmt: skip
-                out[n, d] = first_stop(state, low, cell, x, y, z, dx, dy, dz, CLEAR * cell, np.inf) == np.inf
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def clear_sights(state, low, cell, places, normals, targets, asked, out):
-    """Whether each place (n, 3) sees its own target (n, 3); only where `asked`, False elsewhere."""
-    for n in range(len(places)):
-        out[n] = False
-        if not asked[n]:
-            continue
-        lift = 1.5 * cell
-        x, y, z = (places[n, 0] + lift * normals[n, 0], places[n, 1] + lift * normals[n, 1],
-                   places[n, 2] + lift * normals[n, 2])  # fmt: skip
-        dx, dy, dz = targets[n, 0] - x, targets[n, 1] - y, targets[n, 2] - z
-        length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        if length > 0:
-            dx, dy, dz = dx / length, dy / length, dz / length
-            out[n] = first_stop(state, low, cell, x, y, z, dx, dy, dz, CLEAR * cell, length) == np.inf

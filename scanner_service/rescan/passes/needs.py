@@ -28,7 +28,7 @@ _BARE = 0.25  # a region is rarely a square around its middle
 _FAR_MM = 4.0  # further than this from known surface hidden space is an empty shadow more often
 _BESIDE = 1.3  # so much more is found beside known surface than there
 _EMPTIED = 0.05  # share of emptied cells around from which on hidden space is a rest
-_SURE = 0.6  # share of solid cells around from which on hidden space is taken to begin with surface ...
+_SURE = 0.6  # share of solid cells around from which on a rest is taken to begin with surface ...
 _RARE = 0.4  # ... and up to which it rarely does: an edge of a shadow, or a thin rest
 _LEAST_SURE = 0.2
 _REST_MM = 6.0  # a rest this far from known surface is half as likely as one that touches it
@@ -249,7 +249,7 @@ def _floors(
 def _frontier(surface: KnownSurface) -> Columns:
     """Where hidden space begins; it belongs to no region.
 
-    Where it is thin, and at its edges, it is rarely surface, but for what lies beside known surface.
+    Rests are rarely surface where they are thin, at their edges, and away from known surface.
     """
     n = len(surface.frontier_mm2)
     sure = 1.0 / np.maximum(np.abs(surface.frontier_normals).sum(axis=1), 1.0)  # edges of it face askew
@@ -263,9 +263,8 @@ def _frontier(surface: KnownSurface) -> Columns:
         kind[surface.frontier_emptied > _EMPTIED] = Evidence.REST
         beside, rest = kind == Evidence.FRONTIER, kind == Evidence.REST
         sure[beside] *= _BESIDE - (_BESIDE - 1.0) * np.minimum(away[beside] / _FAR_MM, 1.0)
-        solid = (surface.frontier_solid[~beside] - _RARE) / (_SURE - _RARE)
-        sure[~beside] *= np.clip(solid, _LEAST_SURE, 1.0)
-        sure[rest] /= 1.0 + (away[rest] / _REST_MM) ** 2
+        solid = (surface.frontier_solid[rest] - _RARE) / (_SURE - _RARE)
+        sure[rest] *= np.clip(solid, _LEAST_SURE, 1.0) / (1.0 + (away[rest] / _REST_MM) ** 2)
     none = np.full(n, UNSEEN, dtype=np.int64)
     return surface.frontier_mm, surface.frontier_normals, surface.frontier_mm2, none, kind, sure
 

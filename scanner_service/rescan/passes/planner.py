@@ -7,6 +7,7 @@ import numpy as np
 
 from drivers.scanline import BoolArray, Pose
 from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.rescan.passes.behind import weighed, weighed_like
 from scanner_service.rescan.passes.cover import Choice, Cover
 from scanner_service.rescan.passes.gain import MARGIN, SERVED, Prospect, prospect_of
 from scanner_service.rescan.passes.known_surface import know_surface
@@ -27,11 +28,12 @@ from scanner_service.rescan.region import RescanRegion
 from scanner_service.rescan.regions import RegionReport
 from scanner_service.rescan.requirement import Requirement
 
-MAX_NEEDS = 4_000
-"""Passes are chosen by so many places; more are thinned at random for that, each that is left standing for more area.
-What the chosen pass serves and promises is then worked out for all of them."""
+MAX_NEEDS = 6_000
+"""Passes are chosen by so many places; of more these are drawn, each that is left standing for more area. What the
+chosen pass serves and promises is then worked out for all of them."""
 MAX_SERVED = 12_000
 """... and of what it serves so many places are kept for the reckoning afterwards."""
+_EVEN = 0.2  # so much of the mean worth is added to each: what is worth little is told as out of reach all the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +92,16 @@ def plan_passes(
         named = [one.number for one in regions if wishes.serving.wants(one)]
         needs = needs.only(np.isin(needs.region, named))
     every, given_up = (tried or Tried.nothing()).of(needs, surface.cell_mm)
-    needs = _thinned(every, MAX_NEEDS)
-    sky = look_around(surface, needs.places_mm, needs.normals, optics.max_camera_rad)
-    cover = Cover(surface, needs, sky, reach, optics)
+    drawn = _thinned(every, MAX_NEEDS)
+    sky = look_around(surface, drawn.places_mm, drawn.normals, optics.max_camera_rad)
+    needs = weighed(surface, drawn, sky, reach.may_light(sky.directions))
+    every = needs if drawn is every else weighed_like(every, drawn, needs)
+    cover = Cover(surface, needs, sky, reach, optics, wishes.least_gain_mm2)
     passes: list[RecommendedPass] = []
     left = np.ones(len(every), dtype=np.bool_)
     while len(passes) < wishes.max_passes:
         choice = cover.next(standing)
-        if choice is None or choice.stretch.gain_mm2 < wishes.least_gain_mm2:
+        if choice is None:
             break
         prospect = prospect_of(surface, every, choice.motion, optics) if every is not needs else choice.prospect
         served = left & _served_by(choice.stretch, prospect)
@@ -117,13 +121,20 @@ def _served_by(stretch: Stretch, prospect: Prospect) -> BoolArray:
 
 
 def _thinned(needs: Needs, most: int) -> Needs:
+    """At most so many of them, drawn by what each is worth, and standing together for the gain of all."""
     if len(needs) <= most:
         return needs
+    worth = needs.gain_mm2 + _EVEN * float(needs.gain_mm2.mean())
+    share = np.minimum(1.0, worth * (most / float(worth.sum())))
+    for _ in range(4):  # what is sure to stay leaves room for more of the rest
+        rest = share < 1.0
+        room = most - float(np.count_nonzero(~rest))
+        share[rest] = np.minimum(1.0, worth[rest] * (room / float(worth[rest].sum())))
     rng = np.random.default_rng(len(needs))  # the same needs give the same plan
-    keep = np.zeros(len(needs), dtype=np.bool_)
-    keep[rng.permutation(len(needs))[:most]] = True
+    keep = np.diff(np.floor(np.cumsum(share) + rng.random()), prepend=0.0) > 0
     fewer = needs.only(keep)
-    return fewer.changed(area_mm2=fewer.area_mm2 * (float(needs.area_mm2.sum()) / float(fewer.area_mm2.sum())))
+    fewer = fewer.changed(area_mm2=fewer.area_mm2 / share[keep])
+    return fewer.changed(area_mm2=fewer.area_mm2 * (float(needs.gain_mm2.sum()) / float(fewer.gain_mm2.sum())))
 
 
 def _recommend(

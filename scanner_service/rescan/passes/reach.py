@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.rig import Rig
 from drivers.rig_limits import AxisKind, RigLimits
-from drivers.scanline import Float64Array, Pose, read_only
+from drivers.scanline import BoolArray, Float64Array, Pose, read_only
 from scanner_service.rescan.passes.errors import PassOutOfReach, RigUnlimited
 from scanner_service.rescan.passes.motion import Motion, StraightMotion, TurningMotion
 
@@ -124,6 +124,13 @@ class Reach:
             if self.tilt_rad(rotation) <= self.max_tilt_rad + 1e-9:
                 found.append(Attitude(rotation, None))
         return tuple(found)
+
+    def may_light(self, directions: Float64Array) -> BoolArray:
+        """(d,) False for unit directions (d, 3), from the part, in which the sensor cannot stand however it tilts."""
+        if self.limits.axis is not AxisKind.FREE_POSE:
+            return np.ones(len(directions), dtype=np.bool_)
+        found: BoolArray = directions @ self.up >= math.cos(min(self.max_tilt_rad, math.pi)) - 1e-9
+        return found
 
     def tilt_rad(self, rotation: Float64Array) -> float:
         """Angle between the sensor's z and `up`."""

@@ -10,6 +10,9 @@ from drivers.scanline import BoolArray, Float64Array
 BINS = 48
 RUN_MM = 0.6  # a pass begins and ends this much, or two lines, beyond what it serves
 SPACINGS = 7
+_FIRST, _LAST = np.indices((BINS + 1, BINS + 1))
+_IS_FORWARD = _LAST > _FIRST
+_LENGTH = np.maximum(_LAST - _FIRST, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +45,7 @@ def best_stretch(
     travel_mm: tuple[float, float],
     seconds: Callable[[Float64Array, float], Float64Array],
     overhead_s: float,
+    least_mm2: float = 0.0,
 ) -> Stretch | None:
     """The stretch with the highest gain per second; None when there is no gain at all.
 
@@ -51,6 +55,7 @@ def best_stretch(
     spacing_mm, travel_mm : what the rig can do.
     seconds : times (n,) of lengths (n,) at a spacing.
     overhead_s : time before the first line.
+    least_mm2 : what brings less is no stretch.
     """
     finest, coarsest = spacing_mm
     usable = (coarsest_mm >= finest) & (gain_mm2 > 0) & (position_mm >= travel_mm[0]) & (position_mm <= travel_mm[1])
@@ -68,8 +73,7 @@ def best_stretch(
         run_mm = max(RUN_MM, 2.0 * float(spacing))
         lengths = np.asarray(width * np.arange(BINS + 1) + 2.0 * run_mm, dtype=np.float64)
         times = overhead_s + seconds(lengths, float(spacing))
-        first, last = np.indices(worth.shape)
-        rate = np.where(last > first, worth / times[np.maximum(last - first, 0)], 0.0)
+        rate = np.where(_IS_FORWARD & (worth >= least_mm2), worth / times[_LENGTH], 0.0)
         i, j = np.unravel_index(int(rate.argmax()), rate.shape)
         if rate[i, j] > 0 and (best is None or rate[i, j] > best.gain_per_s):
             start = max(travel_mm[0], low + float(i) * width - run_mm)

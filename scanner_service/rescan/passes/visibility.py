@@ -4,11 +4,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.rescan.passes.known_surface import KnownSurface
-from scanner_service.rescan.passes.marching import clear_sights, clear_ways
 from scanner_service.rescan.passes.motion import Sights
+from scanner_service.rescan.passes.sights import clear_sights, clear_ways
 
 DIRECTIONS = 900  # about 7 degrees apart
 
@@ -45,7 +46,7 @@ def look_around(
     directions = directions_everywhere()
     found = np.zeros((len(places_mm), len(directions)), dtype=np.bool_)
     least = math.cos(min(largest_angle_rad + math.radians(5.0), math.pi / 2))
-    clear_ways(surface.state, surface.low_mm, surface.cell_mm, places_mm, normals, directions, least, found)
+    clear_ways(*_in_the_way(surface), places_mm, normals, directions, least, found)
     return OpenSky(directions, found)
 
 
@@ -54,7 +55,15 @@ def both_see(
 ) -> tuple[BoolArray, BoolArray]:
     """(n,) whether the laser reaches each place, and whether the camera sees it; False where not `asked`."""
     laser, camera = np.zeros(len(places_mm), dtype=np.bool_), np.zeros(len(places_mm), dtype=np.bool_)
-    grid = (surface.state, surface.low_mm, surface.cell_mm)
+    grid = _in_the_way(surface)
     clear_sights(*grid, places_mm, normals, sights.laser_mm, asked, laser)
     clear_sights(*grid, places_mm, normals, sights.camera_mm, asked & laser, camera)
     return laser, camera
+
+
+def _in_the_way(
+    surface: KnownSurface,
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32], Float64Array, Float64Array, Float64Array, float]:
+    """What the kernels of `sights` ask for: a wall that was seen from both sides has no side to pass on."""
+    facing = np.where(surface.two_sided[:, None], 0.0, surface.normals)
+    return surface.state, surface.row, surface.points_mm, facing, surface.low_mm, surface.cell_mm

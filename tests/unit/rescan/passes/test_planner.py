@@ -92,7 +92,7 @@ def test_no_place_is_promised_twice_and_none_for_others_by_whichever_places_pass
     monkeypatch.setattr(planner, "MAX_SERVED", 100)
     few = plan_passes(*judged, free_reach(), OPTICS, Wishes(DENSITY, max_passes=1)).passes[0]
     assert few.promises == plan.passes[0].promises and len(few.places_mm) == 100
-    assert few.place_area_mm2.sum() == pytest.approx(plan.passes[0].place_area_mm2.sum())
+    assert few.place_mm2.sum() == pytest.approx(plan.passes[0].place_mm2.sum())
 
 
 def test_what_a_fixed_axis_cannot_see_is_unreachable_and_turning_the_part_helps():
