@@ -164,7 +164,7 @@ def serve_simulated_scanner(
             raise UnknownDevice(f"{kind} reads no encoder: a turntable stands before a native scanner only")
         table = Table()
         stage_port = PtyPort(table, STAGE_BAUD_RATE)
-        actions |= {"unplug_stage": stage_port.unplug, "replug_stage": stage_port.replug}
+        actions |= {"unplug_stage": stage_port.unplug, "replug_stage": stage_port.replug, "stall": table.stall}
     if kind == "native":
         native_rate = DEFAULT_BAUD_RATE if baud_rate is None else baud_rate
         native = simulated_device(

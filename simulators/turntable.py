@@ -6,6 +6,7 @@ to the place of one. So lines lie where the table truly was, however late a busy
 
 import math
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -95,6 +96,11 @@ class Table:
         """When it has something to say."""
         with self._lock:
             return self._zaber.next_due_s(now_s)
+
+    def stall(self) -> None:
+        """Meet an obstacle, or be held by hand: it stands at once, and says so; homing it mends that."""
+        with self._lock:
+            self._zaber.stall(time.monotonic())
 
     def encoder_mm(self, now_s: float) -> float:
         """Where the table stands, in millimetres of arc."""

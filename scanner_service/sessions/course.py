@@ -72,10 +72,13 @@ class Course:
     def setting_out(self) -> Iterator[None]:
         """While a source is being started the session scans: a short one may have ended before it is.
 
-        When it does not start, the state is what it was.
+        When it does not start, the state is what it was; when it does, an earlier failure is over.
         """
         with self._change:
-            before, self._state = self._state, "scanning"
+            before, said = self._state, self.message
+            self._state = "scanning"
+            if before == "failed":
+                self.message = None
             self.time.start()
         try:
             yield
@@ -83,7 +86,7 @@ class Course:
             with self._change:
                 if not self._is_ending:
                     self.time.stop()
-                    self._state = before
+                    self._state, self.message = before, said
             raise
         self._write_state(self._state)
 

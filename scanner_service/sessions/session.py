@@ -148,11 +148,11 @@ class LiveSession:
 
         Raises
         ------
-        SessionBusy : the session is not stopped.
+        SessionBusy : the session is not over.
         SourceUnusable, DriverError : the source cannot be opened or started; the session stays as it was.
         """
         with self._course.turn:
-            self._course.check(("stopped",), ": a further pass can be scanned once it is stopped")
+            self._course.check(("stopped", "failed"), ": a further pass can be scanned once it is over")
             known = self.source
             source = open_source()
             if self._is_closing:  # meanwhile somebody wanted it closed: nothing is to be switched on any more

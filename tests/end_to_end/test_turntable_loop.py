@@ -92,7 +92,7 @@ def test_a_turntable_is_looped_until_it_can_do_no_more(table):
 
 
 @pytest.mark.long
-def test_a_table_that_is_lost_while_it_homes_fails_the_order_and_ends_the_loop(table):
+def test_a_table_that_stalls_while_it_homes_fails_the_order_and_ends_the_loop_and_the_next_one_goes_on(table):
     service, simulator = table
     session_id, _ = coarse_scan(service, 6.0, 2.0, 0.9)
     where = f"/api/v1/sessions/{session_id}"
@@ -102,13 +102,20 @@ def test_a_table_that_is_lost_while_it_homes_fails_the_order_and_ends_the_loop(t
         return service.client.get(f"{where}/pass-orders").json()["orders"]
 
     wait_for(lambda: any(order["status"] == "running" for order in orders()), "an order to be carried out")
-    simulator.tell("unplug_stage")
+    simulator.tell("stall")
     wait_for(lambda: not service.client.get(f"{where}/rescan").json()["loop"]["running"], "the loop to end")
     (order,) = orders()
     assert order["status"] == "failed" and order["message"]
     why = service.client.get(f"{where}/rescan").json()["loop"]["why_ended"]
     assert why == f"pass order {order['order']} failed: {order['message']}"
-    assert service.status(session_id)["state"] == "failed"
+    failed = service.status(session_id)
+    assert (failed["state"], failed["message"]) == ("failed", order["message"])
     assert [kind for kind, _ in events(service, session_id) if kind.startswith(("pass_o", "loop"))] == [
         "pass_outcome", "loop_ended"
     ]  # fmt: skip
+
+    result = looped(service, session_id, "--max-passes", "1")  # somebody has seen to it
+    assert_driven_by_parts_of_a_turn(result)
+    mended = service.status(session_id)
+    assert (mended["state"], mended["message"]) == ("stopped", None)
+    assert mended["lines"] > failed["lines"]
