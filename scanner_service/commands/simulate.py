@@ -37,7 +37,7 @@ def simulate_command(
         from simulators.process import serve_simulated_scanner  # noqa: PLC0415
         from simulators.pty_port import SimulatedPortError  # noqa: PLC0415
     except ImportError as error:
-        fail(f"the simulator needs {error.name}: install scanner-service[simulation]")
+        fail(f"the simulator needs {error.name}: in the checkout, run `.venv/bin/pip install -e '.[simulation]'`")
     if mesh is None and part not in PARTS:
         fail(f"there is no part {part}; the parts are {', '.join(sorted(PARTS))}")
     stop = threading.Event()
