@@ -4,15 +4,19 @@ Swagger UI is vendored unmodified (`web/vendor/swagger`), so the page works with
 integrators know, with requests to try. It starts from a script file: no inline script, no CDN, no validator.
 """
 
+import re
 from collections.abc import Iterable
+from html import escape
 from http import HTTPStatus
 from pathlib import Path
+from typing import Annotated
 
-from fastapi import APIRouter, Depends, FastAPI
+from fastapi import APIRouter, Depends, FastAPI, Header
 from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.staticfiles import StaticFiles
 
+from scanner_service.api.explanations import Explanation, explanation_of
 from scanner_service.api.guard import GUARD_PROBLEMS
 from scanner_service.api.problems import STANDARD_PROBLEMS, Problem, problem_of_status
 from scanner_service.api.scopes import Requirement, Scoped, public
@@ -36,6 +40,22 @@ _START = """SwaggerUIBundle({
   url: "/openapi.json", dom_id: "#docs", deepLinking: true, validatorUrl: null, queryConfigEnabled: false
 });
 """
+
+
+_PROBLEM = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{title}</title><link rel="icon" href="data:,"><style>
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 42rem; margin: 3rem auto; padding: 0 1rem }}
+dt {{ font-weight: 600 }} dd {{ margin: 0 0 .8rem }} code {{ background: #eee; padding: 0 .2em }}
+</style></head><body><h1>{title}</h1><p>HTTP status {status}</p><dl>
+<dt>What happened</dt><dd>{happened}</dd><dt>What to do</dt><dd>{remedy}</dd>
+<dt>Read on</dt><dd><code>{read}</code> of the program's documents; <a href="/docs">all routes</a></dd></dl>
+</body></html>
+"""
+
+
+def _as_html(told: Explanation) -> dict[str, str]:
+    """Its lines, what stands between backticks as code."""
+    return {name: re.sub(r"`([^`]*)`", r"<code>\1</code>", escape(text)) for name, text in told._asdict().items()}
 
 
 def install_docs(app: FastAPI, problems: Iterable[Problem] = (), requirement: Requirement = public) -> None:
@@ -63,11 +83,16 @@ def install_docs(app: FastAPI, problems: Iterable[Problem] = (), requirement: Re
         return JSONResponse(app.openapi())
 
     @router.get("/problems/{slug}")
-    async def problem_type(slug: str) -> Response:
+    async def problem_type(slug: str, accept: Annotated[str, Header()] = "") -> Response:
         if slug not in by_slug:
             raise HTTPException(404, "There is no problem of that name.")
         problem = by_slug[slug]
-        return JSONResponse({"type": f"/problems/{slug}", "title": problem.title, "status": problem.status})
+        told = explanation_of(slug, problem.status)
+        if "text/html" in accept:  # a person, who has followed the address
+            page = _PROBLEM.format(status=problem.status, title=escape(problem.title), **_as_html(told))
+            return HTMLResponse(page, headers={"Content-Security-Policy": DOCS_CSP})
+        head = {"type": f"/problems/{slug}", "title": problem.title, "status": problem.status}
+        return JSONResponse(head | told._asdict())
 
     app.include_router(router)
     app.mount("/docs/assets", Scoped(StaticFiles(directory=SWAGGER_DIR), requirement), name="docs-assets")

@@ -26,6 +26,7 @@ from scanner_service.storage.exports.points_ply import write_points_ply
 from scanner_service.storage.exports.results_json import write_json
 from scanner_service.storage.exports.whole_file import write_whole
 from scanner_service.storage.formats import ReadOptions, open_cloud
+from scanner_service.storage.formats.normals_of import BY_ANALYSIS
 
 NO_REGIONS = "a plain cloud has no scanlines, so it cannot be told where the scanner missed something, or why"
 
@@ -105,7 +106,7 @@ def analyse_command(
         if density is not None:
             rescan = (snapshot.density_per_mm2 < density) & (snapshot.unreliable != Unreliable.NOT_COUNTED)
             summary["below_required"] = int(rescan.sum())
-        write_points_ply(out / "points.ply", snapshot, rescan, version=__version__)
+        write_points_ply(out / "points.ply", snapshot, rescan, version=__version__, normals_by=BY_ANALYSIS)
         drawing = importlib.import_module("scanner_service.storage.exports.density_png")  # 40 MB that no method needs
         required = math.nan if density is None else density
         write_whole(

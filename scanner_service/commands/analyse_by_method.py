@@ -17,6 +17,7 @@ from scanner_service.commands.compiling_apart import compile_apart
 from scanner_service.commands.terminal import check_folder, console, errors, show_json
 from scanner_service.storage.exports.method_ply import write_method_ply
 from scanner_service.storage.exports.results_json import write_json
+from scanner_service.storage.formats.normals_of import NormalsOf
 
 
 def analyse_file_by_method(
@@ -65,12 +66,20 @@ def analyse_file_by_method(
     )
     reference = summary["against_reference"]
     if isinstance(reference, dict):
+        whose = _WHOSE[cloud.normals_of]
         console.print(
-            f"against the file's own normals: rms {reference['rms_deg']:.2f}°, median {reference['median_deg']:.2f}°, "
+            f"against {whose}: rms {reference['rms_deg']:.2f}°, median {reference['median_deg']:.2f}°, "
             f"within 5° {reference['within_5_deg']:.1%}",
             highlight=False,
         )
     console.print(f"Written to {out}: points.ply, summary.json", highlight=False, soft_wrap=True)
+
+
+_WHOSE: dict[NormalsOf, str] = {
+    "file": "the file's own normals",
+    "live map": "the live map's normals, an estimate too",
+    "scanner analyse": "the normals of an earlier analysis, an estimate too",
+}
 
 
 def refuse(options: Mapping[str, object], why: str) -> None:

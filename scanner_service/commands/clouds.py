@@ -15,6 +15,7 @@ from scanner_service.sessions.stored import find_session, read_session
 from scanner_service.sessions.withdrawals import withdrawn_passes
 from scanner_service.storage.database import is_sqlite
 from scanner_service.storage.formats import FileEmpty, ReadOptions, open_cloud
+from scanner_service.storage.formats.normals_of import NormalsOf
 from scanner_service.storage.reader import RecordReader
 
 NEWEST = "latest"
@@ -31,6 +32,7 @@ class OpenedCloud:
     points_declared: int
     dropped: dict[str, int]
     notes: tuple[str, ...]
+    normals_of: NormalsOf = "file"
 
 
 def open_points(file: Path, units: str | None, session: str | None) -> OpenedCloud:
@@ -47,14 +49,22 @@ def open_points(file: Path, units: str | None, session: str | None) -> OpenedClo
         raise ValueError(f"{file.name} is not a record of this service: leave out --session")
     cloud = open_cloud(file, ReadOptions(parse_units(units)))
     return OpenedCloud(
-        file.name, cloud.points_mm, cloud.normals, None, cloud.points_declared, dict(cloud.dropped), cloud.notes
+        file.name,
+        cloud.points_mm,
+        cloud.normals,
+        None,
+        cloud.points_declared,
+        dict(cloud.dropped),
+        cloud.notes,
+        cloud.normals_of,
     )
 
 
 def open_known(file: Path, units: str | None, session: str | None) -> tuple[KnownCloud, dict[str, int]]:
     """A cloud with the normals that came with it, or a session with those of its live map; what is left out, and why.
 
-    The live map's normals are turned to the laser; they are an estimate too, which the cloud's `reference` says.
+    The live map's normals are turned to the laser; they are an estimate too, which the cloud's `reference` says, also
+    of a file that this program has written.
 
     Raises
     ------
@@ -68,7 +78,7 @@ def open_known(file: Path, units: str | None, session: str | None) -> tuple[Know
         raise ValueError(
             f"{file.name} has no normals to compare with: give a cloud with x y z nx ny nz, or leave the file out"
         )
-    cloud, kept = known_cloud(file.name, opened.points_mm, opened.normals)
+    cloud, kept = known_cloud(file.name, opened.points_mm, opened.normals, opened.normals_of)
     return cloud, {"no reference normal": int((~kept).sum())}
 
 

@@ -16,7 +16,7 @@ from scanner_service import __version__
 from scanner_service.analysis.comparison.noise import LEVELS, NoiseLevel
 from scanner_service.analysis.comparison.peers import peers
 from scanner_service.analysis.comparison.running import Meter, Row, compare, our_methods
-from scanner_service.analysis.comparison.shapes import CUSTOMARY, SHAPES, KnownCloud
+from scanner_service.analysis.comparison.shapes import CUSTOMARY, ESTIMATES, SHAPES, KnownCloud
 from scanner_service.analysis.normals.estimating import METHODS
 from scanner_service.commands.clouds import open_known
 from scanner_service.commands.compiling_apart import compile_apart
@@ -28,8 +28,7 @@ from scanner_service.storage.exports.results_json import write_json
 from scanner_service.storage.exports.whole_file import write_whole
 
 FILES = ("comparison.csv", "comparison.json", "comparison.png")
-LIVE_MAP = "live map"
-NO_TRUTH = "angles are differences from the live map's own reliable normals, not errors: a scan has no known normals"
+NO_TRUTH = "angles are differences from the normals of {}, not errors: these are an estimate too"
 
 
 def compare_command(
@@ -138,8 +137,9 @@ def _clouds(
         told = ", ".join(f"{count:,} {reason.replace('_', ' ')}" for reason, count in lost.items() if count)
         if told:
             errors.print(f"note: left out of {cloud.name}: {told}", highlight=False, soft_wrap=True)
-        if cloud.reference == LIVE_MAP:
-            errors.print(f"note: {cloud.name}: {NO_TRUTH}", highlight=False, soft_wrap=True)
+        if cloud.reference in ESTIMATES:
+            whose = NO_TRUTH.format(ESTIMATES[cloud.reference])
+            errors.print(f"note: {cloud.name}: {whose}", highlight=False, soft_wrap=True)
         clouds.append(cloud)
     return clouds
 
@@ -194,7 +194,8 @@ def _csv(rows: Sequence[dict[str, Any]]) -> bytes:
 def _table(name: str, rows: Sequence[Row]) -> Table:
     """Rms errors in degrees: methods down, noise across."""
     levels = list(dict.fromkeys(row.noise.label for row in rows))
-    what = "difference from the live map" if rows[0].reference == LIVE_MAP else "error"
+    reference = rows[0].reference
+    what = f"difference from {ESTIMATES[reference]}" if reference in ESTIMATES else "error"
     table = Table(title=f"{name}, {rows[0].points:,} points: rms {what} in degrees", title_justify="left")
     table.add_column("method", no_wrap=True)
     for level in levels:

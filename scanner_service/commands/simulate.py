@@ -47,7 +47,7 @@ def simulate_command(
         from simulators.pty_port import SimulatedPortError  # noqa: PLC0415
         from simulators.turntable import turned_part  # noqa: PLC0415
     except ImportError as error:
-        fail(f"the simulator needs {error.name}: install scanner-service[simulation]")
+        fail(f"the simulator needs {error.name}: in the checkout, run `.venv/bin/pip install -e '.[simulation]'`")
     if mesh is None and part not in PARTS:
         fail(f"there is no part {part}; the parts are {', '.join(sorted(PARTS))}")
     if rig_file is not None and not turntable:

@@ -22,14 +22,19 @@ _CACHE = re.compile(r"kernels-[0-9a-f]{16}")
 _GOING = re.compile(r"kernels-[0-9a-f]{16}\.going-\d+")
 
 
+def _ours() -> Path:
+    return Path(str(getattr(config, "CACHE_DIR")))  # noqa: B009 - numba makes this attribute when it reads its settings
+
+
 def mark_used(own: Path | None = None) -> None:
     """Say that a cache is in use, this program's own by default; one that is not there is none."""
+    own = own or _ours()
     try:
-        os.utime(own or Path(config.CACHE_DIR))
+        os.utime(own)
     except FileNotFoundError:  # nothing was compiled yet
         return
     except OSError as error:
-        _LOG.warning("the cache of kernels %s cannot be marked as used: %s", own or config.CACHE_DIR, error)
+        _LOG.warning("the cache of kernels %s cannot be marked as used: %s", own, error)
 
 
 def remove_unused(own: Path | None = None, now_s: Callable[[], float] = time.time) -> list[str]:
@@ -38,7 +43,7 @@ def remove_unused(own: Path | None = None, now_s: Callable[[], float] = time.tim
     Returns the names of those that are gone; what cannot be removed is said in the log. Several programs may do so at
     once: a cache is given another name first, which one of them alone can do.
     """
-    own = own or Path(config.CACHE_DIR)
+    own = own or _ours()
     if not _CACHE.fullmatch(own.name):
         return []  # a folder of the user's: what lies beside it is none of our business
     try:

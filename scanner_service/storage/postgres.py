@@ -156,7 +156,7 @@ def _url(address: str) -> URL:
     except (ArgumentError, NoSuchModuleError) as error:
         raise NotARecord("the address of the record is no postgresql://user@host/database") from error
     except ImportError as error:
-        raise NotARecord("a record in PostgreSQL needs a driver: pip install 'scanner-service[postgres]'") from error
+        raise NotARecord("a record in PostgreSQL needs a driver: .venv/bin/pip install -e '.[postgres]'") from error
     return url
 
 

@@ -16,8 +16,7 @@ def over(client, address):
     return look()
 
 
-def test_a_file_and_a_session_are_analysed_and_wrong_requests_are_refused(running):
-    service = running.service()
+def test_a_file_and_a_session_are_analysed_and_wrong_requests_are_refused(service):
     client = service.client
     rng = np.random.default_rng(1)
     ball = rng.normal(size=(500, 3))
@@ -89,8 +88,7 @@ def test_a_file_and_a_session_are_analysed_and_wrong_requests_are_refused(runnin
     assert client.get(address).status_code == 404
 
 
-def test_clouds_that_make_no_sense_end_with_reasons_or_a_sentence(running):
-    service = running.service()
+def test_clouds_that_make_no_sense_end_with_reasons_or_a_sentence(service):
     client = service.client
     rng = np.random.default_rng(2)
     clouds = {

@@ -316,39 +316,6 @@ def test_pushed_scanlines_are_answered_when_durable_and_stored_once(service):
     assert service.client.post(url, json={"lines": lines[:1]}).status_code == 409
 
 
-def test_a_withdrawn_pass_leaves_the_map_and_stays_in_the_record(running):
-    service = running.service()
-    session_id = service.create(kind="push")
-    service.start(session_id)
-    lines = [
-        {
-            "pass_index": number,
-            "line_index": 10 * number + i,
-            "points_mm": [[0.15 * k, 0.2 * i, 0.1 * number] for k in range(30)],
-            "laser_mm": [2.0, 0.2 * i, 100.0],
-            "line_spacing_mm": 0.2,
-        }
-        for number in range(2)
-        for i in range(10)
-    ]
-    session = f"/api/v1/sessions/{session_id}"
-    service.client.post(f"{session}/scanlines", json={"lines": lines})
-    second = {"device_id": "client", "boot_id": 0, "pass_index": 1}
-    assert service.client.post(f"{session}/passes/withdraw", json=second).json()["withdrawn_points"] == 300
-    again = service.client.post(f"{session}/passes/withdraw", json=second).json()
-    assert (again["withdrawn_points"], again["points"]) == (0, 300)
-    assert again["losses"]["points"]["left_out"] == {"withdrawn": 300}
-    service.client.post(f"{session}/stop")
-    before = service.client.get(f"{session}/summary").json()
-    assert (before["points"], before["points_counted"]) == (600, 300)
-    assert len(service.client.get(f"{session}/scanlines").json()["scanlines"]) == 20
-
-    service.end()
-    service = running.service()
-    after = service.client.get(f"{session}/summary").json()
-    assert (after["points_counted"], after["unreliable"]) == (300, before["unreliable"])
-
-
 def test_a_fresh_one_time_address_opens_the_viewer_once(service):
     command = [sys.executable, "-m", "scanner_service", "open", "--data", service.data, "--url", service.url, "--json"]
     told = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)

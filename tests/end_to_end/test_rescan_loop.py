@@ -15,8 +15,8 @@ def rescan(service, session_id, *arguments, patience_s=500):
     )  # fmt: skip
 
 
-def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(running, tmp_path):
-    service, simulator = running.service(), running.simulator()
+def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(running, service, tmp_path):
+    simulator = running.simulator()
     body = {
         "name": "coarse",
         "source": {"kind": "device", "port": simulator.port, "baud_rate": 3_000_000, "line_rate_hz": 100.0,
@@ -67,8 +67,8 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     assert unclear.status_code == 409 and "reach_mm" in unclear.json()["detail"]
 
 
-def test_a_refused_pass_is_cancelled_and_says_what_to_do(running):
-    service, simulator = running.service(), running.simulator("step")
+def test_a_refused_pass_is_cancelled_and_says_what_to_do(running, service):
+    simulator = running.simulator("step")
     body = {
         "name": "shadowed",
         "source": {"kind": "device", "port": simulator.port, "baud_rate": 3_000_000, "line_rate_hz": 100.0,

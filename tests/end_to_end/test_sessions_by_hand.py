@@ -19,7 +19,7 @@ from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
 from scanner_service.storage.record import Record
-from tests.end_to_end.running import wait_for
+from tests.end_to_end.running import RunningService, wait_for
 from tests.end_to_end.test_live_scan import device, live_client, read_ply
 from tests.unit.analysis.scans import surface_scan
 
@@ -128,23 +128,104 @@ def test_a_killed_scan_is_reopened_with_its_ledger_its_notes_and_the_same_verdic
     assert service.client.post(f"/api/v1/sessions/{'0' * 14}/open").status_code == 404
 
 
-def test_a_creation_that_is_sent_again_makes_no_second_session_also_after_a_restart(running):
-    service = running.service()
-    asked = {"name": "once", "source": {"kind": "push"}}
-    key = {"Idempotency-Key": "7f3a"}
-    first = service.client.post("/api/v1/sessions", json=asked, headers=key)
-    again = service.client.post("/api/v1/sessions", json=asked, headers=key)
+ONCE, ITS_KEY = {"name": "once", "source": {"kind": "push"}}, {"Idempotency-Key": "7f3a"}
+
+
+def created_twice(service):
+    first, again = (service.client.post("/api/v1/sessions", json=ONCE, headers=ITS_KEY) for _ in range(2))
     assert (first.status_code, again.status_code) == (201, 201)
     assert first.json()["id"] == again.json()["id"]
-    other = service.client.post("/api/v1/sessions", json=asked | {"name": "other"}, headers=key)
+    other = service.client.post("/api/v1/sessions", json=ONCE | {"name": "other"}, headers=ITS_KEY)
     assert (other.status_code, other.json()["type"]) == (422, "/problems/idempotency-key-reused")
-    service.kill()
-    service = running.service()
-    assert service.client.post("/api/v1/sessions", json=asked, headers=key).json()["id"] == first.json()["id"]
-    assert len(service.client.get("/api/v1/sessions").json()["sessions"]) == 1
-    assert (
-        service.client.post("/api/v1/sessions", json=asked, headers={"Idempotency-Key": "x" * 256}).status_code == 422
-    )
+    return first.json()["id"]
+
+
+def pushed(service, session_id, numbers, places):
+    lines = [
+        {
+            "line_index": i,
+            "points_mm": [[0.15 * k, 0.2 * i, 0.0] for k in range(places)],
+            "laser_mm": [3.0, 0.2 * i, 100.0],
+            "line_spacing_mm": 0.2,
+        }
+        for i in numbers
+    ]
+    answer = service.client.post(f"/api/v1/sessions/{session_id}/scanlines", json={"lines": lines})
+    assert answer.status_code == 200, answer.text
+
+
+def pushed_in_two_goes(service):
+    session_id = service.create(kind="push")
+    for first in (0, 10):
+        service.start(session_id)
+        pushed(service, session_id, range(first, first + 10), 40)
+        if first == 0:
+            act(service, session_id, "stop")
+    pushed(service, session_id, (3, 4), 40)
+    address = f"/api/v1/sessions/{session_id}/points?limit=10000"
+    wait_for(lambda: service.client.get(address).json()["total"] == 800, "the points to be judged")
+    service.wait_until_kept(session_id)
+    ledger = service.client.get(f"/api/v1/sessions/{session_id}/ledger").json()
+    return session_id, ledger, service.client.get(address).json()
+
+
+def pushed_at_length(service):
+    session_id = service.create(kind="push")
+    service.start(session_id)
+    for first in range(0, 600, 100):
+        pushed(service, session_id, range(first, first + 100), 200)
+    return session_id
+
+
+def withdrawn(service):
+    session_id = service.create(kind="push")
+    service.start(session_id)
+    lines = [
+        {
+            "pass_index": number,
+            "line_index": 10 * number + i,
+            "points_mm": [[0.15 * k, 0.2 * i, 0.1 * number] for k in range(30)],
+            "laser_mm": [2.0, 0.2 * i, 100.0],
+            "line_spacing_mm": 0.2,
+        }
+        for number in range(2)
+        for i in range(10)
+    ]
+    session = f"/api/v1/sessions/{session_id}"
+    service.client.post(f"{session}/scanlines", json={"lines": lines})
+    second = {"device_id": "client", "boot_id": 0, "pass_index": 1}
+    assert service.client.post(f"{session}/passes/withdraw", json=second).json()["withdrawn_points"] == 300
+    again = service.client.post(f"{session}/passes/withdraw", json=second).json()
+    assert (again["withdrawn_points"], again["points"]) == (0, 300)
+    assert again["losses"]["points"]["left_out"] == {"withdrawn": 300}
+    service.client.post(f"{session}/stop")
+    before = service.client.get(f"{session}/summary").json()
+    assert (before["points"], before["points_counted"]) == (600, 300)
+    assert len(service.client.get(f"{session}/scanlines").json()["scanlines"]) == 20
+    return session, before
+
+
+@pytest.fixture(scope="module")
+def restarted(tmp_path_factory):
+    """A service that was killed and started again, and what its sessions told before: one restart for several tests."""
+    data = tmp_path_factory.mktemp("restarted") / "data"
+    with contextlib.ExitStack() as services:
+        first = RunningService(data)
+        services.callback(first.end)
+        told = {each.__name__: each(first) for each in (created_twice, withdrawn, pushed_in_two_goes, pushed_at_length)}
+        first.kill()
+        again = RunningService(data)
+        services.callback(again.end)
+        yield again, told
+
+
+def test_a_creation_that_is_sent_again_makes_no_second_session_also_after_a_restart(restarted):
+    service, told = restarted
+    assert service.client.post("/api/v1/sessions", json=ONCE, headers=ITS_KEY).json()["id"] == told["created_twice"]
+    listed = service.client.get("/api/v1/sessions").json()["sessions"]
+    assert [session["name"] for session in listed].count("once") == 1
+    too_long = service.client.post("/api/v1/sessions", json=ONCE, headers={"Idempotency-Key": "x" * 256})
+    assert too_long.status_code == 422
 
 
 def test_a_creation_that_is_sent_again_is_answered_when_its_file_is_gone(service, tmp_path):
@@ -199,8 +280,7 @@ def test_a_record_file_is_replayed_over_rest_with_its_own_settings_and_verdict(s
     assert refused.status_code == 422 and "own settings" in refused.json()["detail"]
 
 
-def test_a_file_is_brought_over_rest_played_and_removed(running):
-    service = running.service()
+def test_a_file_is_brought_over_rest_played_and_removed(service):
     scan = b"line,x_mm,y_mm,z_mm,laser_x_mm,laser_y_mm,laser_z_mm\n"
     scan += b"".join(b"%d,%d,%d,0,2,%d,90\n" % (n, x, n, n) for n in range(4) for x in range(5))
     brought = service.client.put("/api/v1/files/my scan.csv", content=scan)
@@ -208,7 +288,7 @@ def test_a_file_is_brought_over_rest_played_and_removed(running):
         201,
         {"name": "my scan.csv", "bytes": len(scan), "kind": "csv profiles"},
     )
-    assert service.client.get("/api/v1/files").json()["files"] == [brought.json()]
+    assert brought.json() in service.client.get("/api/v1/files").json()["files"]
     session_id = service.create(kind="replay", file="my scan.csv")
     service.start(session_id)
     service.wait_for_state(session_id, "stopped")
@@ -260,37 +340,17 @@ def test_the_command_line_does_what_the_service_does(service, running):
     assert "holds no session" in gone.output
 
 
-def test_points_and_ledger_are_the_same_after_push_stop_start_and_push_to_the_same_pass(running):
-    service = running.service()
-    session_id = service.create(kind="push")
+def test_a_withdrawn_pass_stays_out_of_the_map_and_in_the_record(restarted):
+    service, told = restarted
+    session, before = told["withdrawn"]
+    after = service.client.get(f"{session}/summary").json()
+    assert (after["points_counted"], after["unreliable"]) == (300, before["unreliable"])
 
-    def push(first, count):
-        lines = [
-            {
-                "line_index": i,
-                "points_mm": [[0.15 * k, 0.2 * i, 0.0] for k in range(40)],
-                "laser_mm": [3.0, 0.2 * i, 100.0],
-                "line_spacing_mm": 0.2,
-            }
-            for i in range(first, first + count)
-        ]
-        answer = service.client.post(f"/api/v1/sessions/{session_id}/scanlines", json={"lines": lines})
-        assert answer.status_code == 200, answer.text
 
-    for first in (0, 10):
-        service.start(session_id)
-        push(first, 10)
-        if first == 0:
-            act(service, session_id, "stop")
-    push(3, 2)
-    address = f"/api/v1/sessions/{session_id}/points?limit=10000"
-    wait_for(lambda: service.client.get(address).json()["total"] == 800, "the points to be judged")
-    service.wait_until_kept(session_id)
-    ledger = service.client.get(f"/api/v1/sessions/{session_id}/ledger").json()
-    live = service.client.get(address).json()
-    service.kill()
-    service = running.service()
-    again = service.client.get(address).json()
+def test_points_and_ledger_are_the_same_after_push_stop_start_and_push_to_the_same_pass(restarted):
+    service, told = restarted
+    session_id, ledger, live = told["pushed_in_two_goes"]
+    again = service.client.get(f"/api/v1/sessions/{session_id}/points?limit=10000").json()
     for name in set(live) - {"version"}:
         assert again[name] == live[name], name
     after = service.client.get(f"/api/v1/sessions/{session_id}/ledger").json()
@@ -330,23 +390,9 @@ def test_a_revoked_key_and_a_logout_end_the_streams_that_were_opened_with_them(t
         service.close()
 
 
-def test_the_live_stream_tells_how_far_a_session_is_that_is_being_reopened(running):
-    service = running.service()
-    session_id = service.create(kind="push")
-    service.start(session_id)
-    lines = [
-        {
-            "line_index": i,
-            "points_mm": [[0.15 * k, 0.2 * i, 0.0] for k in range(200)],
-            "laser_mm": [3.0, 0.2 * i, 100.0],
-            "line_spacing_mm": 0.2,
-        }
-        for i in range(600)
-    ]
-    for first in range(0, 600, 100):
-        service.client.post(f"/api/v1/sessions/{session_id}/scanlines", json={"lines": lines[first : first + 100]})
-    service.kill()
-    service = running.service()
+def test_the_live_stream_tells_how_far_a_session_is_that_is_being_reopened(restarted):
+    service, before = restarted
+    session_id = before["pushed_at_length"]
     with live_client(service, session_id) as client:
         told = [json.loads(client.socket.recv(timeout=30))]
         while told[-1]["type"] != "status":

@@ -43,7 +43,7 @@ def peers(points: int) -> tuple[list[Contestant], list[str]]:
     try:
         open3d = importlib.import_module("open3d")
     except ImportError:
-        return found, ["Open3D is not installed, so it is left out: install scanner-service[bench] to have it"]
+        return found, ["Open3D is not installed, so it is left out: `.venv/bin/pip install -e '.[bench]'` brings it"]
 
     found.append(Contestant("open3d_best", _open3d_settings(open3d, counts)))
     return found, []

@@ -10,8 +10,11 @@ import numpy as np
 from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.errors import MethodRefused
 
-Reference = Literal["shape", "file", "live map"]
-"""Where normals that others are compared with are from; those of a live map are no truth but another estimate."""
+Reference = Literal["shape", "file", "live map", "scanner analyse"]
+"""Where normals that others are compared with are from; those of this program are no truth but another estimate."""
+
+ESTIMATES: dict[Reference, str] = {"live map": "the live map", "scanner analyse": "scanner analyse"}
+"""What a comparison with each of them is a difference from; with all others it is an error."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from scanner_service.analysis.comparison.running import Row
+from scanner_service.analysis.comparison.shapes import ESTIMATES
 
 # Colours of Okabe and Ito, which most people can tell apart; a mark of its own for each method besides.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f", "#000000")
@@ -31,8 +32,8 @@ def comparison_png(rows: Sequence[Row], *, dpi: int = 110) -> bytes:
     _times(axes[panels - 1], rows, methods)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(methods)), frameon=False, fontsize=10)
-    only_sessions = all(row.reference == "live map" for row in rows)
-    what = "Difference of normals from the live map's" if only_sessions else "Error of normals"
+    only_estimates = all(row.reference in ESTIMATES for row in rows)
+    what = "Difference of normals from another estimate's" if only_estimates else "Error of normals"
     figure.suptitle(f"{what} under noise, and what it costs", fontsize=14, fontweight="bold")
     picture = BytesIO()
     figure.savefig(picture, format="png", metadata={"Title": "Comparison of normals", "Software": "scanner-service"})
@@ -54,7 +55,8 @@ def _errors(panel: Axes, cloud: str, rows: Sequence[Row], methods: Sequence[str]
         )
     panel.set_title(f"{cloud}, {rows[0].points:,} points".replace(",", "\u202f"), fontsize=11)
     panel.set_xticks(range(len(levels)), levels, rotation=30, ha="right", fontsize=9)
-    what = "difference from the live map" if rows[0].reference == "live map" else "error"
+    reference = rows[0].reference
+    what = f"difference from {ESTIMATES[reference]}" if reference in ESTIMATES else "error"
     panel.set_ylabel(f"rms {what}, degrees (log scale)")
     panel.set_yscale("log")
     panel.yaxis.set_major_formatter(lambda value, _: f"{value:g}")

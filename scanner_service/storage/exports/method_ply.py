@@ -9,6 +9,7 @@ from drivers.scanline import Float64Array
 from scanner_service import __version__
 from scanner_service.analysis.method_analysis import MethodAnswer
 from scanner_service.storage.exports.whole_file import whole_file
+from scanner_service.storage.formats.normals_of import BY_ANALYSIS
 
 _BLOCK = 1 << 16
 
@@ -44,7 +45,7 @@ def write_method_ply(
     ]
     reasons = ", ".join(f"{number} {name}" for number, name in enumerate(answer.reasons))
     lines = ["ply", "format binary_little_endian 1.0", f"comment scanner-service {version}", "comment units mm"]
-    lines += [f"comment method {answer.method}", f"comment scalar_reason: {reasons}"]
+    lines += [f"comment {BY_ANALYSIS}", f"comment method {answer.method}", f"comment scalar_reason: {reasons}"]
     lines += [f"comment {text}" for text in (*answer.notes, *comments)]
     lines += [f"element vertex {total}", *(f"property double {name}" for name, _ in columns), "end_header"]
     header = "\n".join(" ".join(line.split()) for line in lines) + "\n"

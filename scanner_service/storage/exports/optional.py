@@ -28,6 +28,6 @@ def _module(name: str, formats: str, extra: str) -> Any:
     except ImportError as error:
         package = name.partition(".")[0]
         raise ExtraMissing(
-            f"{formats} files need {package}, which is not installed: run `pip install 'scanner-service[{extra}]'`, "
-            f"in a checkout `.venv/bin/pip install -e '.[{extra}]'`"
+            f"{formats} files need {package}, which is not installed: in the checkout, run "
+            f"`.venv/bin/pip install -e '.[{extra}]'`"
         ) from error

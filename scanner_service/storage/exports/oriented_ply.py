@@ -8,6 +8,7 @@ from drivers.scanline import Float64Array
 from scanner_service import __version__
 from scanner_service.analysis.orientation import Orientation
 from scanner_service.storage.exports.whole_file import whole_file
+from scanner_service.storage.formats.normals_of import BY_ANALYSIS
 
 _ROW = np.dtype(
     [
@@ -27,6 +28,7 @@ def write_oriented_ply(path: Path, points_mm: Float64Array, found: Orientation, 
     ExportNotWritten, ExportNotConfirmed : the file system refused.
     """
     header = ["ply", "format binary_little_endian 1.0", f"comment scanner-service {version}", "comment units mm"]
+    header.append(f"comment {BY_ANALYSIS}")
     header.append("comment scalar_sure is 1 where the side of the normal is known, 0 where it is a guess")
     header.append(f"element vertex {len(points_mm)}")
     header += [f"property {_TYPES[_ROW[name].str]} {name}" for name in _ROW.names or ()]

@@ -11,6 +11,7 @@ import numpy as np
 from scanner_service.analysis.intake import QUANTUM_MM
 from scanner_service.storage.exports.about import About
 from scanner_service.storage.exports.point_stream import PointBlock, PointStream
+from scanner_service.storage.formats.normals_of import BY_LIVE_MAP
 
 _FIELDS: tuple[tuple[str, str], ...] = (
     *((f"normal_{axis}", "<f4") for axis in "xyz"),
@@ -55,6 +56,7 @@ def _header(row: np.dtype[np.void], total: int, about: About) -> bytes:
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
         "# units mm",
+        f"# {BY_LIVE_MAP}",
         f"# about {about.to_text()}",
         "VERSION 0.7",
         "FIELDS " + " ".join(names),

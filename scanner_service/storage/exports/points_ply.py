@@ -15,6 +15,7 @@ from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.storage.exports.about import About
 from scanner_service.storage.exports.point_stream import PointBlock, PointStream, stream_of
 from scanner_service.storage.exports.whole_file import whole_file
+from scanner_service.storage.formats.normals_of import BY_LIVE_MAP
 
 ROW = np.dtype(
     [
@@ -27,7 +28,13 @@ _PLY_TYPES = {"<f8": "double", "<f4": "float", "<i4": "int"}
 
 
 def write_points_ply(
-    path: Path, snapshot: MapSnapshot, rescan: BoolArray, *, version: str = __version__, comments: Sequence[str] = ()
+    path: Path,
+    snapshot: MapSnapshot,
+    rescan: BoolArray,
+    *,
+    version: str = __version__,
+    comments: Sequence[str] = (),
+    normals_by: str = BY_LIVE_MAP,
 ) -> None:
     """Write all points of a snapshot, in its order, as `write_ply` does, whole or not at all.
 
@@ -36,6 +43,7 @@ def write_points_ply(
     rescan : (n,) True where a point belongs to a region worth another pass.
     version : version of the software, written into the header.
     comments : further header lines.
+    normals_by : the header line that says whose the normals are.
 
     Raises
     ------
@@ -44,10 +52,10 @@ def write_points_ply(
     """
     stream = stream_of(snapshot, rescan)
     with whole_file(path) as file:
-        write_ply(file, stream, About(version=version), comments)
+        write_ply(file, stream, About(version=version), (normals_by, *comments))
 
 
-def write_ply(file: BinaryIO, stream: PointStream, about: About, comments: Sequence[str] = ()) -> None:
+def write_ply(file: BinaryIO, stream: PointStream, about: About, comments: Sequence[str] = (BY_LIVE_MAP,)) -> None:
     """Write points, binary little endian, millimetres, part frame.
 
     x y z are the stored coordinates without rounding. `scalar_neighbours` counts the point itself, `scalar_laser_*` is

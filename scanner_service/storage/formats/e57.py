@@ -78,7 +78,7 @@ def read_e57(path: Path, units: Units | None, max_bytes: int) -> Cloud:
     except ImportError:
         raise LibraryAbsent(
             f"{name} is an E57 file, and pye57, which reads them, is not installed: "
-            "run `pip install 'scanner-service[e57]'`, in a checkout `.venv/bin/pip install -e '.[e57]'`"
+            "in the checkout, run `.venv/bin/pip install -e '.[e57]'`"
         ) from None
     lib = pye57.libe57
     parts: list[tuple[Float64Array, Float64Array | None, BoolArray]] = []

@@ -212,8 +212,8 @@ def _unpacker(file: BinaryIO, header: LasHeader, size: int, name: str) -> Any:
         import lazrs  # noqa: PLC0415 - an extra
     except ImportError:
         raise LibraryAbsent(
-            f"{name} is packed, and lazrs, which unpacks it, is not installed: run "
-            "`pip install 'scanner-service[las]'`, in a checkout `.venv/bin/pip install -e '.[las]'`"
+            f"{name} is packed, and lazrs, which unpacks it, is not installed: in the checkout, run "
+            "`.venv/bin/pip install -e '.[las]'`"
         ) from None
     if struct.unpack_from("<H", note)[0] == _LAYERED:
         _check_layers(file, header, note, table_at, lazrs, name)

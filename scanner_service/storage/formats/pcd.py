@@ -2,7 +2,7 @@
 
 import re
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from drivers.scanline import Float64Array
 from scanner_service.storage.formats.clouds import cloud_from
 from scanner_service.storage.formats.errors import ContentDamaged, FileEmpty, FileTruncated, HeaderDamaged
 from scanner_service.storage.formats.lzf import LzfDamaged, decompressed
+from scanner_service.storage.formats.normals_of import normals_of
 from scanner_service.storage.formats.recording import Cloud, Units
 from scanner_service.storage.formats.text_numbers import CUT_NOTE, numbers_of_text
 from scanner_service.storage.formats.units import MILLIMETRES, given_or_named
@@ -65,7 +66,8 @@ def read_pcd(data: bytes, name: str, units: Units | None) -> Cloud:
         columns = _compressed(header, data, name)
     points = np.stack([columns[axis] for axis in "xyz"], axis=1)
     normals = np.stack([columns[part] for part in _NORMAL], axis=1) if set(_NORMAL) <= columns.keys() else None
-    return cloud_from(name, "pcd", points, normals, given_or_named(units, header.comments) or MILLIMETRES, None, notes)
+    unit = given_or_named(units, header.comments) or MILLIMETRES
+    return replace(cloud_from(name, "pcd", points, normals, unit, None, notes), normals_of=normals_of(header.comments))
 
 
 def parse_header(data: bytes, name: str) -> PcdHeader:

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from drivers.scanline import BoolArray, Float64Array
 from scanner_service.storage.formats.errors import ContentDamaged, FileEmpty, HeaderDamaged
+from scanner_service.storage.formats.normals_of import normals_of
 from scanner_service.storage.formats.ply_body import Ragged, read_rows
 from scanner_service.storage.formats.ply_header import PlyHeader, check_size, parse_header
 from scanner_service.storage.formats.recording import MM_PER_UNIT, Cloud, Units, finite_rows
@@ -93,6 +94,7 @@ def cloud_of(vertices: PlyVertices, name: str) -> Cloud:
         points_declared=len(kept),
         dropped={"not_finite": lost} if lost else {},
         notes=notes,
+        normals_of=normals_of(vertices.header.comments),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from drivers.scanline import BoolArray, Float64Array, Scanline, read_only
 from scanner_service.storage.formats.errors import OptionRefused
+from scanner_service.storage.formats.normals_of import NormalsOf
 
 Units = Literal["mm", "m", "inch", "auto"]
 LineAlong = Literal["column", "row"]
@@ -83,7 +84,8 @@ class Recording:
 class Cloud:
     """The points of a file without their scanlines.
 
-    `points_mm` (n, 3) are finite; `normals` (n, 3) are the file's own, of any length and possibly NaN, or None.
+    `points_mm` (n, 3) are finite; `normals` (n, 3) are the file's own, of any length and possibly NaN, or None;
+    `normals_of` says whose they are, by the file's header.
     `points_declared == len(points_mm) + sum(dropped.values())`.
     """
 
@@ -94,6 +96,7 @@ class Cloud:
     points_declared: int
     dropped: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    normals_of: NormalsOf = "file"
 
     def __post_init__(self) -> None:
         read_only(self.points_mm)

@@ -119,4 +119,4 @@ def test_a_library_that_is_not_installed_is_told_as_such(clients, path, monkeypa
     monkeypatch.setitem(__import__("sys").modules, "pye57", None)
     refused = clients[Role.OPERATOR].post(path, json={"formats": ["e57"]})
     assert refused.status_code == 501
-    assert "scanner-service[e57]" in refused.json()["detail"]
+    assert "pip install -e '.[e57]'" in refused.json()["detail"]

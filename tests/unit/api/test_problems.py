@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,9 +13,21 @@ from fastapi import FastAPI
 from hypothesis import given
 from hypothesis import strategies as st
 
+from scanner_service.api.access import ACCESS_PROBLEMS
+from scanner_service.api.app import SESSION_PROBLEMS
+from scanner_service.api.explanations import EXPLANATIONS, explanation_of
+from scanner_service.api.guard import GUARD_PROBLEMS
 from scanner_service.api.keys import Role
-from scanner_service.api.problems import Problem, problem_document, problem_of_status, register_problems
+from scanner_service.api.problems import (
+    STANDARD_PROBLEMS,
+    Problem,
+    problem_document,
+    problem_of_status,
+    register_problems,
+)
 from tests.unit.api.small_service import StageBlocked, client, served, small_app
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +54,30 @@ def test_the_type_of_every_problem_can_be_looked_up(http: httpx.Client) -> None:
     asked = [http.get(path) for path in ["/api/v1/blocked", "/api/v1/broken", "/nowhere", "/a\\b", "/login?token=x"]]
     asked.append(http.post("/api/v1/lines", json={}))
     for document in [response.json() for response in asked]:
-        assert http.get(document["type"]).json() == {name: document[name] for name in ["type", "title", "status"]}
+        told = http.get(document["type"]).json()
+        assert {name: told.pop(name) for name in ["type", "title", "status"]}.items() <= document.items()
+        assert set(told) == {"happened", "remedy", "read"}
     assert http.get("/problems/no-such").status_code == 404
+
+
+def test_every_kind_of_problem_says_what_happened_what_to_do_and_where_to_read_on() -> None:
+    known = [*SESSION_PROBLEMS.values(), *ACCESS_PROBLEMS.values(), *GUARD_PROBLEMS, *STANDARD_PROBLEMS]
+    assert {problem.slug for problem in known} == set(EXPLANATIONS)
+    anchors: dict[str, set[str]] = {}
+    for slug, told in [*EXPLANATIONS.items(), ("not-found", explanation_of("not-found", 404))]:
+        page, _, anchor = told.read.partition("#")
+        if page not in anchors:
+            heads = re.findall(r"^#+ (.*)$", (ROOT / page).read_text(), re.MULTILINE)
+            anchors[page] = {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads}
+        assert not anchor or anchor in anchors[page], (slug, told.read)
+        assert all(text.endswith((".", ")")) and text.count("`") % 2 == 0 for text in told[:2]), slug
+
+
+def test_a_person_who_follows_the_address_of_a_problem_gets_a_page(http: httpx.Client) -> None:
+    page = http.get("/problems/internal-error", headers={"Accept": "text/html,*/*;q=0.8"})
+    assert page.headers["content-type"].startswith("text/html")
+    assert EXPLANATIONS["internal-error"].remedy in page.text
+    assert "script-src 'self'" in page.headers["content-security-policy"]
 
 
 def test_an_unknown_error_tells_nothing_of_the_inside_and_is_logged(

@@ -165,11 +165,20 @@ def test_a_session_is_compared_with_its_live_map_and_the_figures_are_called_diff
     chosen = ["--session", "latest", "--method", "gaussian", "--noise", "0box", "--out", out]
     answer = run("compare", record, *chosen)
     assert answer.exit_code == 0, answer.output
-    assert "differences from the live map" in one_line(answer)
+    assert "differences from the normals of the live map" in one_line(answer)
     assert "rms error" not in one_line(answer)
     assert "2,250 not counted" in one_line(answer)  # the pass that was withdrawn
     (row,) = json.loads((out / "comparison.json").read_text())["rows"]
     assert (row["reference"], row["points"]) == ("live map", 30 * 70 + 12 * 40)
     assert row["median_deg"] < 5.0
     assert run("compare", record, "--session", "nobody", "--out", out).exit_code == 1
+
+    written = run("export", "latest", "--record", record, "--format", "ply", "--format", "pcd", "--out", out / "files")
+    assert written.exit_code == 0, written.output
+    points = ["--method", "gaussian", "--noise", "0box", "--out", out]
+    for file in (next((out / "files").rglob("*.ply")), next((out / "files").rglob("*.pcd"))):
+        answer = run("compare", file, *points)
+        assert answer.exit_code == 0, answer.output
+        assert "differences from the normals of the live map" in one_line(answer), file
+        assert "rms error" not in one_line(answer)
     assert run("compare", "--session", "latest", "--out", out).exit_code == 1
