@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from benchmarks.rescan_flagged import Agreement, Looked, agreements
+from benchmarks.rescan_flagged import Agreement, Looked, agreements_of_lit, agreements_of_shadows
 from benchmarks.rescan_parts import PARTS, drawn, mesh_from
 from benchmarks.rescan_truth import (
     Bools,
@@ -183,11 +183,15 @@ def judged(case: Case) -> tuple[MapSnapshot, RegionReport, LaserLineScanner, Swe
 
 
 def compare(
-    case: Case, spacing_mm: float, closely_mm: float = CLOSELY_MM
+    case: Case, spacing_mm: float, closely_mm: float = CLOSELY_MM, with_shadows: bool = True
 ) -> tuple[dict[str, Agreement], dict[str, Any]]:
     """Agreement by reason of one case, and what was scanned.
 
-    `spacing_mm` is the distance of the samples that tell shadows, `closely_mm` of those that tell the other reasons.
+    Parameters
+    ----------
+    spacing_mm : distance of the samples that tell shadows, which take long, and where anything is to be flagged.
+    closely_mm : distance of those that tell the other reasons. Their true area is a sliver here and there, and the
+        band around its border is as exact as samples are close.
     """
     begun_s = time.perf_counter()
     snapshot, report, scanner, sweep, requirement = judged(case)
@@ -203,19 +207,21 @@ def compare(
     is_noisy = None if box is None else (lambda points: is_in(points, box))
     assert requirement.density_per_mm2 is not None
     asked = (optics, sweep, requirement.density_per_mm2, CONSTANT_MM, is_noisy)
-    caster, samples = Caster(case.part), sample_surface(case.part, spacing_mm)
-    sight = sight_of(caster, samples, optics, sweep)
-    looked = Looked(samples, sight, truth_of(caster, samples, sight, *asked))
-    near = sample_surface(case.part, closely_mm)
-    near_sight = sight_of(caster, near, optics, sweep)
-    closely = Looked(near, near_sight, truth_of_lit(near, near_sight, *asked))
     radius = float(np.sqrt(2.0)) * LINE_SPACING_MM + CONSTANT_MM
-    found = agreements(report.regions, case.part, looked, closely, optics, sweep, radius)
+    caster, samples = Caster(case.part), sample_surface(case.part, closely_mm)
+    sight = sight_of(caster, samples, optics, sweep)
+    closely = Looked(samples, sight, truth_of_lit(samples, sight, *asked))
+    found = agreements_of_lit(report.regions, closely, optics, sweep, radius)
+    if with_shadows:
+        samples = sample_surface(case.part, spacing_mm)
+        sight = sight_of(caster, samples, optics, sweep)
+        looked = Looked(samples, sight, truth_of(caster, samples, sight, *asked))
+        found |= agreements_of_shadows(report.regions, case.part, looked, optics, sweep, radius)
     found[ISOLATED] = isolated_returns(snapshot, report, specks(case, scanner, sweep, 1), radius)
     about = {
         "points": len(snapshot),
         "regions": len(report.regions),
-        "samples": len(samples),
+        "samples": len(closely.samples),
         "seconds": time.perf_counter() - begun_s,
     }
     return found, about

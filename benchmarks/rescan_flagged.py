@@ -121,36 +121,10 @@ def ribbon_of(regions: Sequence[RescanRegion]) -> trimesh.Trimesh | None:
     return mesh if len(mesh.faces) else None
 
 
-def agreements(
-    regions: Sequence[RescanRegion],
-    part: trimesh.Trimesh,
-    looked: Looked,
-    closely: Looked,
-    optics: Optics,
-    sweep: Sweep,
-    radius_mm: float,
-) -> dict[str, Agreement]:
-    """Of each reason, and of any (`ANY`: worth another pass, whatever it is called), how flagged and true area agree.
-
-    Shadows are compared on the samples `looked` at, the other reasons on those looked at `closely`, which need no
-    shadow: true area is a sliver here and there, and the band around a sliver is as wide as its samples are close.
-    """
-    found = _of_lit(regions, closely, optics, sweep, radius_mm)
-    samples, sight = looked.samples, looked.sight
-    anything = np.logical_or.reduce(list(looked.truth.values()))
-    lit = np.logical_or.reduce(
-        [~np.ones_like(anything), *flagged_visible(regions, samples, sight, optics, sweep).values()]
-    )
-    for reason, true, seen in (("shadow", looked.truth["shadow"], lit & ~lit), (ANY, anything, lit)):
-        closed, right_mm2, ribbon_mm2 = _ribbons(regions, part, samples, true, sight.grazing, radius_mm)
-        found[reason] = _agreement(looked, true, seen, closed, radius_mm) + Agreement(0.0, 0.0, ribbon_mm2, right_mm2)
-    return found
-
-
-def _of_lit(
+def agreements_of_lit(
     regions: Sequence[RescanRegion], looked: Looked, optics: Optics, sweep: Sweep, radius_mm: float
 ) -> dict[str, Agreement]:
-    """The agreement of every reason but `shadow`."""
+    """Of each reason but `shadow`, how flagged and true area agree."""
     flagged = flagged_visible(regions, looked.samples, looked.sight, optics, sweep)
     none = np.zeros(len(looked.samples), dtype=bool)
     return {
@@ -158,6 +132,26 @@ def _of_lit(
         for reason, true in looked.truth.items()
         if reason != "shadow"
     }
+
+
+def agreements_of_shadows(
+    regions: Sequence[RescanRegion],
+    part: trimesh.Trimesh,
+    looked: Looked,
+    optics: Optics,
+    sweep: Sweep,
+    radius_mm: float,
+) -> dict[str, Agreement]:
+    """The same of shadows, and of any reason (`ANY`): worth another pass, whatever it is called."""
+    samples, sight = looked.samples, looked.sight
+    anything = np.logical_or.reduce(list(looked.truth.values()))
+    none = np.zeros(len(samples), dtype=bool)
+    lit = np.logical_or.reduce([none, *flagged_visible(regions, samples, sight, optics, sweep).values()])
+    found = {}
+    for reason, true, seen in (("shadow", looked.truth["shadow"], none), (ANY, anything, lit)):
+        closed, right_mm2, ribbon_mm2 = _ribbons(regions, part, samples, true, sight.grazing, radius_mm)
+        found[reason] = _agreement(looked, true, seen, closed, radius_mm) + Agreement(0.0, 0.0, ribbon_mm2, right_mm2)
+    return found
 
 
 def _agreement(looked: Looked, true: Bools, seen: Bools, closed: Bools, radius_mm: float) -> Agreement:
