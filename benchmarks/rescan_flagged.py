@@ -28,19 +28,19 @@ from benchmarks.rescan_truth import (
 )
 from scanner_service.rescan.region import RescanRegion
 
+ANY = "any reason"
 _DIRECTIONS = 48
 _LIFT_MM = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Areas in mm², the band left out: true, true and flagged, flagged, flagged and true; `flagged_any` of the true."""
+    """Areas in mm², the band left out: true, true and flagged, flagged, flagged and true."""
 
     true_mm2: float
     found_mm2: float
     flagged_mm2: float
     right_mm2: float
-    found_any_mm2: float
 
     @property
     def recall(self) -> float:
@@ -56,9 +56,18 @@ class Agreement:
         mine, others = self.areas(), other.areas()
         return Agreement(*(a + b for a, b in zip(mine, others, strict=True)))
 
-    def areas(self) -> tuple[float, float, float, float, float]:
-        """The five areas."""
-        return (self.true_mm2, self.found_mm2, self.flagged_mm2, self.right_mm2, self.found_any_mm2)
+    def areas(self) -> tuple[float, float, float, float]:
+        """The four areas."""
+        return (self.true_mm2, self.found_mm2, self.flagged_mm2, self.right_mm2)
+
+
+@dataclass(frozen=True, slots=True)
+class Looked:
+    """Samples of a part, what a sweep sees of them, and of which reasons that is the truth."""
+
+    samples: Samples
+    sight: Sight
+    truth: dict[str, Bools]
 
 
 def flagged_visible(
@@ -69,6 +78,8 @@ def flagged_visible(
     place = np.column_stack([sight.angle_rad * depth, sight.station_mm])
     flagged: dict[str, Bools] = {}
     for region in regions:
+        if region.reason.label == "shadow":
+            continue
         inside = np.zeros(len(samples), dtype=bool)
         for loop in region.outline_mm:
             station, angle = scan_coordinates(loop, optics, sweep)
@@ -110,35 +121,44 @@ def ribbon_of(regions: Sequence[RescanRegion]) -> trimesh.Trimesh | None:
     return mesh if len(mesh.faces) else None
 
 
-def agreements(
+def agreements_of_lit(
+    regions: Sequence[RescanRegion], looked: Looked, optics: Optics, sweep: Sweep, radius_mm: float
+) -> dict[str, Agreement]:
+    """Of each reason but `shadow`, how flagged and true area agree."""
+    flagged = flagged_visible(regions, looked.samples, looked.sight, optics, sweep)
+    none = np.zeros(len(looked.samples), dtype=bool)
+    return {
+        reason: _agreement(looked, true, flagged.get(reason, none), none, radius_mm)
+        for reason, true in looked.truth.items()
+        if reason != "shadow"
+    }
+
+
+def agreements_of_shadows(
     regions: Sequence[RescanRegion],
     part: trimesh.Trimesh,
-    samples: Samples,
-    sight: Sight,
-    truth: dict[str, Bools],
+    looked: Looked,
     optics: Optics,
     sweep: Sweep,
     radius_mm: float,
 ) -> dict[str, Agreement]:
-    """Of each reason, how flagged and true area agree."""
-    flagged = flagged_visible(regions, samples, sight, optics, sweep)
-    hidden, right, ribbon_mm2 = _ribbons(regions, part, samples, truth["shadow"], sight.grazing, radius_mm)
-    anything = hidden.copy()
-    for marks in flagged.values():
-        anything |= marks
-    found: dict[str, Agreement] = {}
-    for reason, true in truth.items():
-        counted = ~band_of(samples, true, radius_mm) & ~sight.grazing
-        mine = hidden if reason == "shadow" else flagged.get(reason, np.zeros(len(samples), dtype=bool))
-        area = samples.area_mm2
-        found[reason] = Agreement(
-            true_mm2=area * int((true & counted).sum()),
-            found_mm2=area * int((true & mine & counted).sum()),
-            flagged_mm2=ribbon_mm2 if reason == "shadow" else area * int((mine & counted).sum()),
-            right_mm2=right if reason == "shadow" else area * int((mine & true & counted).sum()),
-            found_any_mm2=area * int((true & (anything | mine) & counted).sum()),
-        )
+    """The same of shadows, and of any reason (`ANY`): worth another pass, whatever it is called."""
+    samples, sight = looked.samples, looked.sight
+    anything = np.logical_or.reduce(list(looked.truth.values()))
+    none = np.zeros(len(samples), dtype=bool)
+    lit = np.logical_or.reduce([none, *flagged_visible(regions, samples, sight, optics, sweep).values()])
+    found = {}
+    for reason, true, seen in (("shadow", looked.truth["shadow"], none), (ANY, anything, lit)):
+        closed, right_mm2, ribbon_mm2 = _ribbons(regions, part, samples, true, sight.grazing, radius_mm)
+        found[reason] = _agreement(looked, true, seen, closed, radius_mm) + Agreement(0.0, 0.0, ribbon_mm2, right_mm2)
     return found
+
+
+def _agreement(looked: Looked, true: Bools, seen: Bools, closed: Bools, radius_mm: float) -> Agreement:
+    """Of samples that are flagged where they are seen, or closed off by a ribbon, whose own area is not in it."""
+    counted = ~band_of(looked.samples, true, radius_mm) & ~looked.sight.grazing
+    areas = (true, true & (seen | closed), seen, seen & true)
+    return Agreement(*(looked.samples.area_mm2 * int((marks & counted).sum()) for marks in areas))
 
 
 def _ribbons(

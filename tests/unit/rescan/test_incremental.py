@@ -12,6 +12,7 @@ from drivers.scanline import Scanline, SensorGeometry
 from scanner_service.analysis.intake import StoredLine, quantise
 from scanner_service.analysis.live_map import LiveMap, MapSettings
 from scanner_service.rescan.coverage import CoverageBook, observed_coverage
+from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.regions import RegionFinder, find_regions
 from scanner_service.rescan.requirement import Interest, Requirement
 from scanner_service.sessions.mirror import Mirror
@@ -165,4 +166,26 @@ def test_after_every_line_of_a_long_pass_regions_are_those_found_from_nothing_an
         if at >= 76:
             judged.append(analyst.check())
     assert max(judged[1:]) < 0.6 * len(analyst.live), judged
+    analyst.live.close()
+
+
+def test_a_wall_that_turns_out_a_shadow_is_judged_again_in_lines_that_nothing_touched() -> None:
+    """A wall 12 mm high along the travel: 20 lines have returns on it, as on a flank, and most after them have none."""
+    rng, analyst = np.random.default_rng(4), Analyst(REQUIREMENTS["default"], False)
+
+    def wall(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        on_it = (x > 0.9) & (x < 1.4)
+        way_down = np.where(x < 1.2, 2.0, -2.0) + rng.uniform(-0.6, 0.6, len(x)) if at < 20 else np.full(len(x), np.nan)
+        return np.where(on_it, way_down, np.where(x < 0.9, 6.0, -6.0))
+
+    shadows = []
+    for at in range(61):
+        analyst.live.add(_line(wall, 0, at, 0.5 + 0.3 * at, 0.3, False, rng))
+        if at in (36, 60):  # between the two the pass keeps its frame
+            analyst.check()
+            snapshot = analyst.live.snapshot()
+            first = snapshot.lines.line_index[snapshot.line] < 15
+            reason = find_regions(snapshot, REQUIREMENTS["default"], None, 0.005).reason
+            shadows.append(int((reason[first] == Reason.SHADOW).sum()))
+    assert shadows[0] == 0 and shadows[1] > 20
     analyst.live.close()
