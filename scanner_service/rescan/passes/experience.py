@@ -16,7 +16,8 @@ _ENOUGH_MM2 = 50.0  # a pass that asked for so much counts half of that, and non
 _HALF_MM2 = 20.0  # of how a kind varies a pass that asked for so much tells half as much as a very large one ...
 _FIRST_PASSES = 3.0  # ... of which the first spread weighs as many
 _LEAST = 0.05  # nothing is ruled out for good
-_WORN_PASSES = 10.0  # what is left of hidden space when so many passes have looked is surface 1/e as often
+_WORN_PASSES = 10.0  # what is left of hidden space when so many passes have looked is surface 1/e as often ...
+_WORN_OUT = 0.4  # ... but is looked at, so that a loop does not end before it was
 
 
 def experience_of(earlier: Sequence[Outcome]) -> Experience:
@@ -59,5 +60,5 @@ def experience_of(earlier: Sequence[Outcome]) -> Experience:
 def _worn(passes: int) -> Float64Array:
     """By `Evidence`, how much less it brings after some passes than at first."""
     worn = np.ones(len(Evidence))
-    worn[Evidence.REST] = math.exp(-passes / _WORN_PASSES)
+    worn[Evidence.REST] = max(math.exp(-passes / _WORN_PASSES), _WORN_OUT)
     return worn

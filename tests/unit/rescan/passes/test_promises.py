@@ -166,7 +166,7 @@ def test_the_more_passes_have_looked_the_less_is_expected_of_what_is_left_and_of
 
     idle = became(0.0, 0.0)
     chances = np.array([rest(*[idle] * n) for n in range(17)])
-    assert chances == pytest.approx(FIRST_CHANCES[Evidence.REST] * np.exp(-np.arange(17) / 10.0))
+    assert chances == pytest.approx(FIRST_CHANCES[Evidence.REST] * np.maximum(np.exp(-np.arange(17) / 10.0), 0.4))
     others = [one for one in Evidence if one is not Evidence.REST]
     assert [experience_of([idle] * 9).chances[one] for one in others] == [FIRST_CHANCES[one] for one in others]
     as_foretold = became(50.0, 50.0 * rest(idle), Evidence.REST)
