@@ -44,6 +44,13 @@ class ScannerOptics:
         """Distance of the laser's origin from z = 0."""
         return float(self.geometry.laser_mm[2])
 
+    @property
+    def camera_aside_rad(self) -> float:
+        """Angle at z = 0 between the ways to the laser and to the camera."""
+        laser, camera = self.geometry.laser_mm, self.geometry.camera_mm
+        cosine = float(laser @ camera) / float(np.linalg.norm(laser) * np.linalg.norm(camera))
+        return math.acos(max(-1.0, min(1.0, cosine)))
+
     def widening(self, z_mm: Float64Array) -> Float64Array:
         """How much wider than at z = 0 the fan is at z (n,)."""
         wide: Float64Array = (self.geometry.laser_mm[2] - z_mm) / self.geometry.laser_mm[2]

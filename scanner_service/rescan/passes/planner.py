@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from scanner_service.rescan.passes.serving import EVERYTHING, Serving
 from scanner_service.rescan.passes.stretch import Stretch
 from scanner_service.rescan.passes.tried import Tried
 from scanner_service.rescan.passes.unreachable import in_vain, lost_regions, unreachable
-from scanner_service.rescan.passes.visibility import look_around
+from scanner_service.rescan.passes.visibility import APART_RAD, look_around
 from scanner_service.rescan.reference import ReferenceCoverage
 from scanner_service.rescan.region import RescanRegion
 from scanner_service.rescan.regions import RegionReport
@@ -93,7 +94,8 @@ def plan_passes(
         needs = needs.only(np.isin(needs.region, named))
     every, given_up = (tried or Tried.nothing()).of(needs, surface.cell_mm)
     drawn = _thinned(every, MAX_NEEDS)
-    sky = look_around(surface, drawn.places_mm, drawn.normals, optics.max_camera_rad)
+    asked = partial(reach.may_light, wider_rad=optics.camera_aside_rad + APART_RAD)
+    sky = look_around(surface, drawn.places_mm, drawn.normals, optics.max_camera_rad, asked)
     needs = weighed(surface, drawn, sky, reach.may_light(sky.directions))
     every = needs if drawn is every else weighed_like(every, drawn, needs)
     cover = Cover(surface, needs, sky, reach, optics, wishes.least_gain_mm2)

@@ -125,11 +125,14 @@ class Reach:
                 found.append(Attitude(rotation, None))
         return tuple(found)
 
-    def may_light(self, directions: Float64Array) -> BoolArray:
-        """(d,) False for unit directions (d, 3), from the part, in which the sensor cannot stand however it tilts."""
+    def may_light(self, directions: Float64Array, wider_rad: float = 0.0) -> BoolArray:
+        """(d,) False for unit directions (d, 3), from the part, in which the sensor cannot stand however it tilts.
+
+        `wider_rad` is added to the limit: for the camera, which looks from aside.
+        """
         if self.limits.axis is not AxisKind.FREE_POSE:
             return np.ones(len(directions), dtype=np.bool_)
-        found: BoolArray = directions @ self.up >= math.cos(min(self.max_tilt_rad, math.pi)) - 1e-9
+        found: BoolArray = directions @ self.up >= math.cos(min(self.max_tilt_rad + wider_rad, math.pi)) - 1e-9
         return found
 
     def tilt_rad(self, rotation: Float64Array) -> float:

@@ -1,6 +1,7 @@
 """What a place on the part can see, laser and camera alike, against all that is solid or hidden; knows no density."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,8 @@ from scanner_service.rescan.passes.motion import Sights
 from scanner_service.rescan.passes.sights import clear_sights, clear_ways
 
 DIRECTIONS = 900  # about 7 degrees apart
+APART_RAD = math.radians(8.0)
+"""No direction is further than this from the nearest one that is listed."""
 
 
 def directions_everywhere(count: int = DIRECTIONS) -> Float64Array:
@@ -40,14 +43,24 @@ class OpenSky:
 
 
 def look_around(
-    surface: KnownSurface, places_mm: Float64Array, normals: Float64Array, largest_angle_rad: float
+    surface: KnownSurface,
+    places_mm: Float64Array,
+    normals: Float64Array,
+    largest_angle_rad: float,
+    asked: Callable[[Float64Array], BoolArray] | None = None,
 ) -> OpenSky:
-    """The open sky of places (n, 3), up to an angle from their normals (n, 3)."""
+    """The open sky of places (n, 3), up to an angle from their normals (n, 3).
+
+    Only directions in which `asked` says that laser or camera may stand are looked along; the others count as closed.
+    """
     directions = directions_everywhere()
-    found = np.zeros((len(places_mm), len(directions)), dtype=np.bool_)
+    sky = np.zeros((len(places_mm), len(directions)), dtype=np.bool_)
+    which = np.ones(len(directions), dtype=np.bool_) if asked is None else asked(directions)
+    found = np.zeros((len(places_mm), int(which.sum())), dtype=np.bool_)
     least = math.cos(min(largest_angle_rad + math.radians(5.0), math.pi / 2))
-    clear_ways(*_in_the_way(surface), places_mm, normals, directions, least, found)
-    return OpenSky(directions, found)
+    clear_ways(*_in_the_way(surface), places_mm, normals, directions[which], least, found)
+    sky[:, which] = found
+    return OpenSky(directions, sky)
 
 
 def both_see(
