@@ -41,6 +41,14 @@ def looped(service, session_id, *arguments, patience_s=500):
     return json.loads(done.stdout)
 
 
+def loop_that_ended(service, where):
+    def loop():
+        return service.client.get(f"{where}/rescan").json()["loop"]
+
+    wait_for(lambda: not loop()["running"], "the loop to end")
+    return loop()
+
+
 def events(service, session_id):
     told = service.client.get(f"/api/v1/sessions/{session_id}/events?limit=1000").json()["events"]
     return [(event["kind"], event["details"]) for event in told]
@@ -56,8 +64,8 @@ def assert_driven_by_parts_of_a_turn(result):
 
 def test_part_of_a_turn_is_scanned_again_by_itself_and_a_table_that_is_gone_ends_the_loop(table):
     service, simulator = table
-    session_id, before = coarse_scan(service, 6.0, 2.0, 0.35)
-    assert before["lines"] == int(0.35 * FULL_TURN_MM / 2.0) + 1
+    session_id, before = coarse_scan(service, 4.0, 3.0, 0.35)
+    assert before["lines"] == int(0.35 * FULL_TURN_MM / 3.0) + 1
     result = looped(service, session_id, "--max-passes", "1")
     assert result["loop"]["why_ended"] == "the limit of 1 passes is met"
     assert_driven_by_parts_of_a_turn(result)
@@ -69,10 +77,12 @@ def test_part_of_a_turn_is_scanned_again_by_itself_and_a_table_that_is_gone_ends
     assert [kind for kind in kinds if kind in wanted] == wanted
 
     simulator.tell("unplug_stage")
-    result = looped(service, session_id, "--max-passes", "1")
-    (order,) = result["orders"]
+    where = f"/api/v1/sessions/{session_id}"
+    assert service.client.post(f"{where}/rescan", json={"max_passes": 1}).status_code == 202
+    loop = loop_that_ended(service, where)
+    order = service.client.get(f"{where}/pass-orders").json()["orders"][-1]
     assert order["status"] == "failed" and simulator.ready["stage_port"] in order["message"]
-    assert result["loop"]["why_ended"] == f"pass order {order['order']} failed: {order['message']}"
+    assert loop["why_ended"] == f"pass order {order['order']} failed: {order['message']}"
     assert service.status(session_id)["state"] == "stopped"  # nothing was scanned, and what there is stays as it was
     told = [details for kind, details in events(service, session_id) if kind == "pass_outcome"]
     assert (told[-1]["status"], told[-1]["message"]) == ("failed", order["message"])
@@ -103,11 +113,10 @@ def test_a_table_that_stalls_while_it_homes_fails_the_order_and_ends_the_loop_an
 
     wait_for(lambda: any(order["status"] == "running" for order in orders()), "an order to be carried out")
     simulator.tell("stall")
-    wait_for(lambda: not service.client.get(f"{where}/rescan").json()["loop"]["running"], "the loop to end")
+    loop = loop_that_ended(service, where)
     (order,) = orders()
     assert order["status"] == "failed" and order["message"]
-    why = service.client.get(f"{where}/rescan").json()["loop"]["why_ended"]
-    assert why == f"pass order {order['order']} failed: {order['message']}"
+    assert loop["why_ended"] == f"pass order {order['order']} failed: {order['message']}"
     failed = service.status(session_id)
     assert (failed["state"], failed["message"]) == ("failed", order["message"])
     assert [kind for kind, _ in events(service, session_id) if kind.startswith(("pass_o", "loop"))] == [
