@@ -7,11 +7,11 @@ import sys
 from tests.end_to_end.running import ROOT
 
 
-def rescan(service, session_id, *arguments, patience_s=500):
+def rescan(service, session_id, *arguments):
     command = [sys.executable, "-m", "scanner_service", "rescan", session_id, *arguments, "--json"]
     return subprocess.run(
         [*command, "--data", str(service.data), "--url", service.url],
-        capture_output=True, text=True, cwd=ROOT, timeout=patience_s, check=False,
+        capture_output=True, text=True, cwd=ROOT, timeout=500, check=False,
     )  # fmt: skip
 
 
