@@ -115,10 +115,10 @@ class RunningSimulator:
         self.process.stdout.close()
 
 
-def wait_for(condition, what, seen=lambda: "nothing"):
+def wait_for(condition, what, patience_s=PATIENCE_S, seen=lambda: "nothing"):
     """Poll until the condition holds; fails with a sentence, and with what was seen last, when it never does."""
-    deadline_s = time.monotonic() + PATIENCE_S
+    deadline_s = time.monotonic() + patience_s
     while not condition():
         if time.monotonic() > deadline_s:
-            raise AssertionError(f"waited {PATIENCE_S:g} s for {what}; last seen: {seen()}")
+            raise AssertionError(f"waited {patience_s:g} s for {what}; last seen: {seen()}")
         time.sleep(0.05)

@@ -35,10 +35,18 @@ def coarse_scan(service, density_per_mm2, line_spacing_mm, share_of_turn):
     return session_id, service.wait_for_state(session_id, "stopped")
 
 
-def looped(service, session_id, *arguments, patience_s=500):
-    done = rescan(service, session_id, "--auto", *arguments, patience_s=patience_s)
+def looped(service, session_id, *arguments):
+    done = rescan(service, session_id, "--auto", *arguments)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
+
+
+def loop_that_ended(service, where):
+    def loop():
+        return service.client.get(f"{where}/rescan").json()["loop"]
+
+    wait_for(lambda: not loop()["running"], "the loop to end")
+    return loop()
 
 
 def events(service, session_id):
@@ -56,8 +64,8 @@ def assert_driven_by_parts_of_a_turn(result):
 
 def test_part_of_a_turn_is_scanned_again_by_itself_and_a_table_that_is_gone_ends_the_loop(table):
     service, simulator = table
-    session_id, before = coarse_scan(service, 6.0, 2.0, 0.35)
-    assert before["lines"] == int(0.35 * FULL_TURN_MM / 2.0) + 1
+    session_id, before = coarse_scan(service, 4.0, 3.0, 0.35)
+    assert before["lines"] == int(0.35 * FULL_TURN_MM / 3.0) + 1
     result = looped(service, session_id, "--max-passes", "1")
     assert result["loop"]["why_ended"] == "the limit of 1 passes is met"
     assert_driven_by_parts_of_a_turn(result)
@@ -69,10 +77,12 @@ def test_part_of_a_turn_is_scanned_again_by_itself_and_a_table_that_is_gone_ends
     assert [kind for kind in kinds if kind in wanted] == wanted
 
     simulator.tell("unplug_stage")
-    result = looped(service, session_id, "--max-passes", "1")
-    (order,) = result["orders"]
+    where = f"/api/v1/sessions/{session_id}"
+    assert service.client.post(f"{where}/rescan", json={"max_passes": 1}).status_code == 202
+    loop = loop_that_ended(service, where)
+    order = service.client.get(f"{where}/pass-orders").json()["orders"][-1]
     assert order["status"] == "failed" and simulator.ready["stage_port"] in order["message"]
-    assert result["loop"]["why_ended"] == f"pass order {order['order']} failed: {order['message']}"
+    assert loop["why_ended"] == f"pass order {order['order']} failed: {order['message']}"
     assert service.status(session_id)["state"] == "stopped"  # nothing was scanned, and what there is stays as it was
     told = [details for kind, details in events(service, session_id) if kind == "pass_outcome"]
     assert (told[-1]["status"], told[-1]["message"]) == ("failed", order["message"])
@@ -80,15 +90,21 @@ def test_part_of_a_turn_is_scanned_again_by_itself_and_a_table_that_is_gone_ends
 
 @pytest.mark.long
 @pytest.mark.timeout(3600)
-def test_a_turntable_is_looped_until_it_can_do_no_more(table):
+def test_a_turntable_is_looped_until_the_coverage_is_reached_that_was_asked_for(table):
     service, _ = table
     session_id, before = coarse_scan(service, 16.0, 0.8, 0.6)
-    result = looped(service, session_id, "--max-passes", "30", patience_s=3500)
-    assert result["loop"]["why_ended"].startswith("nothing that the rig reaches by itself is left")
+    assert before["coverage"] < 0.2
+    where = f"/api/v1/sessions/{session_id}"
+    limits = {"max_passes": 12, "coverage_share": 0.8}
+    assert service.client.post(f"{where}/rescan", json=limits).status_code == 202
+    wait_for(lambda: not service.client.get(f"{where}/rescan").json()["loop"]["running"], "the loop to end", 3500.0)
+    loop = loop_that_ended(service, where)
+    assert loop["why_ended"] == "the observed coverage of 80.0% is reached" and loop["passes"] > 1
+    result = service.client.get(f"{where}/pass-orders").json()
     assert_driven_by_parts_of_a_turn(result)
     large = [order["outcome"] for order in result["orders"] if order["outcome"]["promised_mm2"] > 100.0]
-    assert large and all(outcome["reached_mm2"] > 0.75 * outcome["promised_mm2"] for outcome in large)
-    assert before["coverage"] < 0.2 and service.status(session_id)["coverage"] > 0.8
+    assert large and all(outcome["reached_mm2"] > 0.7 * outcome["promised_mm2"] for outcome in large)
+    assert service.status(session_id)["coverage"] >= 0.8
 
 
 @pytest.mark.long
@@ -103,11 +119,10 @@ def test_a_table_that_stalls_while_it_homes_fails_the_order_and_ends_the_loop_an
 
     wait_for(lambda: any(order["status"] == "running" for order in orders()), "an order to be carried out")
     simulator.tell("stall")
-    wait_for(lambda: not service.client.get(f"{where}/rescan").json()["loop"]["running"], "the loop to end")
+    loop = loop_that_ended(service, where)
     (order,) = orders()
     assert order["status"] == "failed" and order["message"]
-    why = service.client.get(f"{where}/rescan").json()["loop"]["why_ended"]
-    assert why == f"pass order {order['order']} failed: {order['message']}"
+    assert loop["why_ended"] == f"pass order {order['order']} failed: {order['message']}"
     failed = service.status(session_id)
     assert (failed["state"], failed["message"]) == ("failed", order["message"])
     assert [kind for kind, _ in events(service, session_id) if kind.startswith(("pass_o", "loop"))] == [
