@@ -22,7 +22,7 @@ from scanner_service.sessions.source import OnPorts, Source
 from scanner_service.sessions.source_specs import PushSpec, SourceSpec, let_go
 from scanner_service.sessions.still_sources import PushSource, SpentSource
 from scanner_service.sessions.withdrawals import SERVICE_ENDED
-from scanner_service.storage.errors import RecordError
+from scanner_service.storage.errors import RecordError, SessionUnknown
 from scanner_service.storage.record import Record, utc_now
 from scanner_service.storage.rows import CreationKey, SessionRow
 
@@ -66,6 +66,9 @@ class SessionBook:
         self._desks: dict[str, tuple[LiveSession, PassDesk]] = {}
         self._opening: dict[str, Opening] = {}
         self._creating: set[str] = set()
+        self._deleting: set[str] = set()
+        self._places = 0  # kept for sessions that are being made
+        self._is_closed = False
         self._failures: dict[str, str] = {}
         self._lock = threading.RLock()
         for row in self._all_rows():
@@ -146,8 +149,7 @@ class SessionBook:
         reference: ReferenceSurface | None,
     ) -> LiveSession:
         self.make_room_on_disk()
-        with self._lock:
-            self._make_room()
+        with self._place_kept():
             opened = self._open(spec) if source is None else source
             try:
                 row = self.record.create_session(
@@ -163,18 +165,39 @@ class SessionBook:
                 nominal = nominal_of(named, self._meshes) if reference is None else Nominal(reference)
                 session = LiveSession(row, self.record, opened, nominal=nominal)
                 session.open()
-                self._live[row.session_id] = session
-                return session
             except BaseException:
                 opened.stop()
                 raise
+            self._hold(session)
+            return session
+
+    @contextlib.contextmanager
+    def _place_kept(self) -> Iterator[None]:
+        """Keep a place among the open sessions for one that is being made; nobody waits for its disk or its device."""
+        with self._lock:
+            self._make_room()
+            self._places += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._places -= 1
+
+    def _hold(self, session: LiveSession) -> None:
+        """Hold a session open from now on; raises SessionBusy, and closes it, when all are being closed."""
+        with self._lock:
+            if not self._is_closed:
+                self._live[session.row.session_id] = session
+                return
+        session.close()
+        raise SessionBusy("the service is being closed")
 
     def _open(self, spec: SourceSpec) -> Source:
         """Open a source; when a port is held by a session of this book, say by which."""
         try:
             return spec.open()
         except PortBusy as error:
-            for session in self._live.values():
+            for session in self.open_sessions():
                 source = session.source
                 if session.state in _HOLDING and isinstance(source, OnPorts) and is_among(error.path, source.ports):
                     raise PortBusy(
@@ -202,6 +225,8 @@ class SessionBook:
                 live = self._live.get(session_id)
                 if live is not None:
                     return live
+                if session_id in self._deleting:
+                    raise SessionUnknown(f"session {session_id} is being deleted")
                 opening = self._opening.get(session_id)
                 if opening is None:
                     row = self.record.get_session(session_id)
@@ -229,8 +254,7 @@ class SessionBook:
             _LOG.warning("session %s is %s", row.session_id, nominal.refused)
         session = LiveSession(row, self.record, source, nominal=nominal)
         session.open(taken)
-        with self._lock:
-            self._live[row.session_id] = session
+        self._hold(session)
         session.terms.read_again()  # it may have been renamed since its row was read
         return session
 
@@ -280,15 +304,24 @@ class SessionBook:
 
     def delete(self, session_id: str) -> None:
         """Stop and delete a session with everything stored of it; raises SessionUnknown."""
-        opening = self._opening.get(session_id)
-        if opening is not None:
+        while True:
+            with self._lock:
+                opening = self._opening.get(session_id)
+                if opening is None:
+                    if session_id in self._deleting:
+                        raise SessionUnknown(f"session {session_id} is being deleted")
+                    self._deleting.add(session_id)
+                    live = self._live.pop(session_id, None)
+                    self._desks.pop(session_id, None)
+                    break
             opening.done.wait()
-        with self._lock:
-            live = self._live.pop(session_id, None)
-            self._desks.pop(session_id, None)
+        try:
             if live is not None:
                 live.close()
             self.record.delete_session(session_id)
+        finally:
+            with self._lock:
+                self._deleting.discard(session_id)
 
     def make_room_on_disk(self) -> list[tuple[str, str]]:
         """Delete what the retention says; the sessions deleted, with the reason.
@@ -320,14 +353,16 @@ class SessionBook:
 
     def close(self) -> None:
         """Stop and close all sessions; the record stays open."""
-        with self._lock, contextlib.ExitStack() as stack:  # one that cannot be closed keeps none of the others open
-            for live in self._live.values():
+        with self._lock:
+            self._is_closed = True
+            closing, self._live = self._live, {}
+        with contextlib.ExitStack() as stack:  # one that cannot be closed keeps none of the others open
+            for live in closing.values():
                 stack.callback(live.close)
-            self._live = {}
 
     def _make_room(self) -> None:
         """Close the session that was opened first among those that neither scan nor stand between two passes."""
-        if len(self._live) + len(self._opening) < MAX_LIVE:
+        if len(self._live) + len(self._opening) + self._places < MAX_LIVE:
             return
         for session_id, session in self._live.items():
             if session.state in OVER and not self._is_at_work(session_id):

@@ -15,7 +15,7 @@ from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec
 from scanner_service.sessions.withdrawals import SCAN_ENDED
-from scanner_service.storage.errors import CreationKeyReused
+from scanner_service.storage.errors import CreationKeyReused, SessionUnknown
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.record import Record
 from scanner_service.storage.rows import CreationKey
@@ -154,8 +154,8 @@ def crossing(monkeypatch, record, verb):
     """The first call of a record's verb is kept between its answer and its caller; `done` lets it go."""
     reached, done, call = threading.Event(), threading.Event(), getattr(record, verb)
 
-    def kept(*of):
-        answer = call(*of)
+    def kept(*of, **more):
+        answer = call(*of, **more)
         if not reached.is_set():
             reached.set()
             assert done.wait(60)
@@ -192,6 +192,56 @@ def test_of_two_names_that_cross_the_one_in_the_record_is_told(book, monkeypatch
     done.set()
     first.result(60)
     assert session.row.name == book.record.get_session(session.row.session_id).name == "second"
+
+
+@pytest.fixture
+def stored(book):
+    """The id of a session that nobody holds open."""
+    row = book.record.create_session("stored", settings=SETTINGS.to_dict(), source=PushSpec().to_dict())
+    return row.session_id
+
+
+def test_while_a_session_is_made_another_is_opened_and_its_place_is_kept(book, stored, monkeypatch, aside):
+    reached, done = crossing(monkeypatch, book.record, "create_session")
+    making = aside(book.create, "made", PushSpec(), SETTINGS)
+    assert reached.wait(60)
+    assert aside(book.get, stored).result(60).row.name == "stored"
+    with monkeypatch.context() as full:
+        full.setattr("scanner_service.sessions.book.MAX_LIVE", 2)
+        with pytest.raises(SessionBusy, match="scanning or waiting"):
+            aside(book.create, "too many", PushSpec(), SETTINGS).result(60)
+    done.set()
+    made = making.result(60)
+    assert book.get(made.row.session_id) is made
+
+
+def test_while_a_session_is_deleted_another_is_opened_and_it_is_gone_for_all(book, stored, monkeypatch, aside):
+    session_id = book.create("gone", PushSpec(), SETTINGS).row.session_id
+    reached, done = crossing(monkeypatch, book.record, "delete_session")
+    deleting = aside(book.delete, session_id)
+    assert reached.wait(60)
+    assert aside(book.get, stored).result(60).row.name == "stored"
+    for ask in (book.get, book.delete):
+        with pytest.raises(SessionUnknown):
+            aside(ask, session_id).result(60)
+    done.set()
+    deleting.result(60)
+    with pytest.raises(SessionUnknown):
+        book.get(session_id)
+
+
+def test_a_session_that_is_made_while_all_are_closed_is_closed_too(book, monkeypatch, aside):
+    stopped = threading.Event()
+    source = ReplaySource(LINES, len(LINES), let_go=stopped.set)
+    reached, done = crossing(monkeypatch, book.record, "create_session")
+    making = aside(lambda: book.create("late", PushSpec(), SETTINGS, source=source))
+    assert reached.wait(60)
+    book.close()
+    done.set()
+    with pytest.raises(SessionBusy, match="being closed"):
+        making.result(60)
+    assert stopped.is_set()
+    assert book.open_sessions() == []
 
 
 def test_a_session_that_is_renamed_while_it_is_reopened_has_the_new_name(tmp_path, monkeypatch):
