@@ -30,6 +30,7 @@ T = TypeVar("T")
 _LOG = logging.getLogger(__name__)
 INBOX_LINES = 512
 _RECORD_PATIENCE_S = 5.0
+_COMMIT_PATIENCE_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +106,14 @@ class Engine:
         if not self._hand_over(_Ask(question, reply)):  # type: ignore[arg-type]
             reply.set_exception(SessionNotLive(self.failure or "the session is closed"))
         return reply
+
+    def end_scan(self) -> None:
+        """Close every pass, and wait until the account of the scan is whole: for the last commits, while there are any.
+
+        Raises SessionNotLive.
+        """
+        self.ask(lambda engine: engine.close_passes()).result()
+        self.ledger.wait_until_decided(0.0 if self._record.is_failing else _COMMIT_PATIENCE_S)
 
     def ask_between(self, question: "Callable[[Engine], T]") -> "Future[T]":
         """Have a question answered before the next scanline, whatever waits in the inbox; never waits itself.

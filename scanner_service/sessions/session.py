@@ -38,7 +38,6 @@ from scanner_service.storage.record import Record
 from scanner_service.storage.rows import EventRow, SessionRow, Stored
 
 REQUIREMENT_CHANGED = "requirement_changed"
-_COMMIT_PATIENCE_S = 10.0
 
 
 class LiveSession:
@@ -371,9 +370,7 @@ class LiveSession:
             with self._awaited.awaited("scan_ended") as begins:
                 self._course.wait_for_lines()
                 try:
-                    self.engine.ask(lambda engine: engine.close_passes()).result()
-                    # The account of a scan that is over is whole: the last commits are waited for, while there are any.
-                    self.engine.ledger.wait_until_decided(0.0 if self._record.is_failing else _COMMIT_PATIENCE_S)
+                    self.engine.end_scan()
                 except SessionError as error:
                     failure = failure or str(error)
                 self._judgement.renew(self.source, begins=begins)

@@ -3,6 +3,7 @@
 import { FileBringer } from "./bringing.js";
 import { byId, element } from "./element.js";
 import { ExportMenu } from "./exports.js";
+import { freeAreas } from "./free_areas.js";
 import { drawRuler, drawTriad } from "./gauges.js";
 import { Guide } from "./guide.js";
 import { InterestBox } from "./interest_box.js";
@@ -172,18 +173,6 @@ function trouble(text) {
 }
 
 // --- the picture ----------------------------------------------------------------------------------------------------
-
-// The picture's parts that no control and no legend lies on: all of it, or what is left beside or above the legend.
-function freeAreas(width, height) {
-  const tools = document.querySelector(".tools");
-  const whole = { left: 28, top: tools.offsetTop + tools.offsetHeight + 22, right: width - 28, bottom: height - 28 };
-  const card = byId("legend");
-  if (card.hidden) return [whole];
-  const beside = { ...whole, left: card.offsetLeft + card.offsetWidth + 20 };
-  const above = { ...whole, bottom: card.offsetTop - 14 };
-  const areas = [beside, above].filter(({ left, top, right, bottom }) => right - left > 0.4 * width && bottom - top > 0.4 * height);
-  return areas.length ? areas : [whole];
-}
 
 function followOrder(order) {
   ordered = order;
