@@ -120,8 +120,10 @@ def test_flagged_area_agrees_with_the_truth_of_a_generated_part(part: str, reaso
 @pytest.mark.long
 @pytest.mark.skipif(not MESHES.is_dir(), reason="the folder of shared meshes is absent")
 @pytest.mark.parametrize("name", rescan.MESHES)
-def test_steep_area_of_a_mesh_agrees_with_the_truth_where_there_is_much_of_it(name: str) -> None:
-    found, _ = rescan.compare(rescan.cases(name, MESHES)[0], 0.15)
-    if found["steep"].true_mm2 > 20.0:
-        assert found["steep"].recall >= 0.95
-        assert found["steep"].precision >= 0.95
+def test_steep_area_of_a_mesh_agrees_with_the_truth(name: str) -> None:
+    """Where there is less than 20 mm2 of it, one facet makes a percent."""
+    found, _ = rescan.compare(rescan.cases(name, MESHES)[0], 0.15, with_shadows=False)
+    if found["steep"].true_mm2 > 0.0:
+        least = 0.95 if found["steep"].true_mm2 > 20.0 else 0.9
+        assert found["steep"].recall >= least
+        assert found["steep"].precision >= least
