@@ -43,6 +43,8 @@ STAGE_MM = (-100.0, 400.0)
 BUFFER_BYTES = 262_144
 """Larger than a real scanner's: the simulator shares a computer with its client, and a pause of the computer of up to
 0.8 s at the default rate must not look like a slow wire."""
+TURN_BUFFER_BYTES = 8_388_608
+"""A whole turn in fine lines: the table turns on, however long the computer does not listen to the scanner."""
 PATIENT_DEAD_MAN_S = 5.0
 """Longer than a real scanner's, for the same reason: no laser is on, and a busy computer is no host that is gone."""
 _LOOK_S = 0.1
@@ -106,7 +108,7 @@ def simulated_device(
             info,
             turned_scene(optics, part, scene_rng),
             rng=device_rng,
-            buffer_bytes=BUFFER_BYTES,
+            buffer_bytes=TURN_BUFFER_BYTES,
             encoder_mm_per_count=ENCODER_MM_PER_COUNT,
             encoder_mm=table.encoder_mm,
             dead_man_s=dead_man_s,
