@@ -28,6 +28,9 @@ _KEPT_CUBES = 40
 _MOST_RESOLVED = 1000
 _SHOWN = 0.3  # share of a shadow's surface that has points near, from which on a verdict without it is believed
 _MOST_PLACES = 256
+_ALONG = (0.25, 0.5, 0.75)  # of the way from the rim of a shadow to its foot
+_BEHIND = 0.7  # of the way to the nearer end: what a shadow hides lies no further behind its straight surface
+_BEFORE = 0.5  # cosine: a point faces what lies before it
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +51,7 @@ class _Known:
     region: RescanRegion
     cubes: set[tuple[int, int, int]]
     passes: frozenset[int]  # that had points on it when it was found, or when it last counted as rescanned
-    places_mm: Float64Array = field(default_factory=lambda: np.zeros((0, 3)))  # spread over a shadow's surface
+    places_mm: Float64Array = field(default_factory=lambda: np.zeros((0, 4)))  # of a shadow: see `_places_of`
 
 
 class RegionBook:
@@ -263,7 +266,7 @@ class _Surface:
 
     def __init__(self, snapshot: MapSnapshot) -> None:
         counted = np.flatnonzero(snapshot.neighbours > 0)
-        self._points_mm = snapshot.points_mm[counted]
+        self._points_mm, self._normals = snapshot.points_mm[counted], snapshot.normals[counted]
         self._radius_mm = float(np.median(snapshot.radius_mm[counted])) if len(counted) else 0.0
         self._cube = _cube_rows(snapshot.points_mm[counted])
         self._pass = snapshot.lines.pass_number[snapshot.line[counted]]
@@ -292,16 +295,28 @@ class _Surface:
         return not any(self._open[rows].any() for rows in self._rows(cubes))
 
     def shows(self, known: _Known) -> bool:
-        """True when points lie near to enough of a shadow's surface; of other regions there have been points before."""
+        """True when enough of a shadow's surface has points; of other regions there have been points before.
+
+        A place has a point when one is near it, or when one further off, but nearer than the ends of the shadow,
+        faces it: what is hidden lies behind the straight surface from rim to foot.
+        """
         if not len(known.places_mm):
             return True
-        reach = float(np.fmax(self._radius_mm, known.region.line_spacing_mm))
-        low, high = known.places_mm.min(axis=0) - reach, known.places_mm.max(axis=0) + reach
-        around = self._points_mm[((self._points_mm >= low) & (self._points_mm <= high)).all(axis=1)]
-        if not len(around):
+        places, behind = known.places_mm[:, :3], known.places_mm[:, 3]
+        near = float(np.fmax(self._radius_mm, known.region.line_spacing_mm))
+        reach = np.fmax(near, behind)
+        low, high = (places - reach[:, None]).min(axis=0), (places + reach[:, None]).max(axis=0)
+        inside = ((self._points_mm >= low) & (self._points_mm <= high)).all(axis=1)
+        if not inside.any():
             return False
-        away = cKDTree(around).query(known.places_mm, distance_upper_bound=reach)[0]
-        return float(np.isfinite(away).mean()) >= _SHOWN
+        around, normals = self._points_mm[inside], self._normals[inside]
+        found = cKDTree(around).query_ball_point(places, reach)
+        row = np.concatenate([np.asarray(rows, dtype=np.int64) for rows in found])
+        place = np.repeat(np.arange(len(places)), [len(rows) for rows in found])
+        way = places[place] - around[row]
+        away = np.linalg.norm(way, axis=1)
+        faces = np.einsum("ij,ij->i", way, normals[row]) >= _BEFORE * away  # False where there is no normal
+        return len(np.unique(place[faces | (away <= near)])) >= _SHOWN * len(places)
 
     def is_there(self, cubes: set[tuple[int, int, int]], region: RescanRegion) -> bool:
         """True when the cubes still hold points: a withdrawn pass resolves nothing. Untouched surface never had any."""
@@ -322,23 +337,35 @@ def _cubes_of(snapshot: MapSnapshot, region: RescanRegion) -> set[tuple[int, int
 
 
 def _places_of(region: RescanRegion) -> Float64Array:
-    """Places (k, 3) inside the loops of a shadow, on the triangles between each loop's sides and its middle."""
-    if region.reason is not Reason.SHADOW:
-        return np.zeros((0, 3))
-    found = []
-    for loop in region.outline_mm:
-        middle, after = loop.mean(axis=0), np.roll(loop, -1, axis=0)
-        found += [middle + share * (0.5 * (loop + after) - middle) for share in (0.3, 0.6)]
-    places = np.concatenate(found) if found else np.zeros((0, 3))
+    """Places on a shadow's surface and how far behind it hidden surface may lie, (k, 4), mm; none of other regions.
+
+    A shadow's outline is its rim and, the other way round, its foot: one loop, or two when the rim is a ring.
+    """
+    if region.reason is not Reason.SHADOW or not region.outline_mm:
+        return np.zeros((0, 4))
+    if len(region.outline_mm) == 1:
+        rim, foot = np.array_split(region.outline_mm[0], 2)
+    else:
+        rim, foot = region.outline_mm[:2]
+    count = min(len(rim), len(foot))
+    rim, foot = rim[:count], foot[::-1][:count]
+    length = np.linalg.norm(foot - rim, axis=1)
+    places = np.concatenate(
+        [np.column_stack([rim + share * (foot - rim), _BEHIND * min(share, 1.0 - share) * length]) for share in _ALONG]
+    )
     return np.asarray(places[:: max(1, math.ceil(len(places) / _MOST_PLACES))], dtype=np.float64)
 
 
 def _kept_places(kept: Sequence[Sequence[float]]) -> Float64Array:
-    """Places as a book kept them, none where it is of a time when it kept none; raises ValueError for others."""
-    places = np.array(kept, dtype=np.float64).reshape(-1, 3)
-    if len(places) > _MOST_PLACES or not np.isfinite(places).all():
+    """Places as a book kept them, none where it is of a time when it kept none; raises ValueError for others.
+
+    Books of a time when only places were kept say nothing of what lies behind.
+    """
+    wide = len(kept[0]) if len(kept) else 4
+    places = np.array(kept, dtype=np.float64).reshape(-1, wide)
+    if wide not in (3, 4) or len(places) > _MOST_PLACES or not np.isfinite(places).all():
         raise ValueError(f"a region has at most {_MOST_PLACES} places, all of them finite; {len(places)} were kept")
-    return places
+    return places if wide == 4 else np.column_stack([places, np.zeros(len(places))])
 
 
 def _number(value: float) -> float | None:

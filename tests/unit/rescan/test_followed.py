@@ -10,7 +10,7 @@ from scanner_service.rescan.followed import RegionBook
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.rescan.regions import find_regions
-from tests.unit.rescan.synthetic_scan import Scan, snapshot_of, straight_down
+from tests.unit.rescan.synthetic_scan import Scan, snapshot_of, straight_down, triangulated
 
 X, Y = np.arange(-4, 4, 0.2), np.arange(0, 14, 0.3)
 
@@ -88,6 +88,40 @@ def test_a_shadow_is_not_resolved_by_a_pass_that_brought_nothing_to_its_surface(
     assert "no points" in book.current[0].history[-1].why
     book.follow(replace(after, version=3), [])
     assert len(book.current) == len(shadows)  # nor is it forgotten later
+
+
+def _wall_from_before(heights: np.ndarray) -> Scan:
+    """The wall of the cliff as a second pass sees it that looks along +y: a line at each height."""
+    scan = Scan(places=len(X))
+    for number, height in enumerate(heights):
+        scan.points.append(np.column_stack([X, np.full_like(X, 7.0), np.full_like(X, height)]))
+        scan.index.append(np.arange(len(X)))
+        scan.line_index.append(number)
+        scan.pass_number.append(2)
+        scan.position.append(float(height))
+        scan.laser.append(np.array([0.0, -1e4, float(height)]))
+        scan.spacing.append(0.3)
+    return scan
+
+
+def _raised_cliff(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return _cliff(x, y) + 0.4
+
+
+@pytest.mark.parametrize("is_wall_seen", [False, True])
+def test_a_shadow_is_resolved_once_what_it_hides_is_seen_and_not_by_the_floor_alone(is_wall_seen: bool) -> None:
+    """The camera is hidden along 3.5 mm of floor: wall and floor lie up to 3 mm behind the straight way between."""
+    scan = triangulated(_raised_cliff, X, Y, 0.3)
+    book = RegionBook()
+    _followed(book, scan, 1)
+    (shadow,) = (region for region in book.current if region.reason is Reason.SHADOW)
+    assert shadow.area_mm2 > 40.0
+    seen = scan.joined(straight_down(_raised_cliff, X, np.arange(3.6, 6.9, 0.3), 0.3, pass_number=3))
+    if is_wall_seen:
+        seen = seen.joined(_wall_from_before(np.arange(0.6, 6.3, 0.3)))
+    _followed(book, seen, 2)
+    status = {region.region_id: region.status for region in (*book.current, *book.resolved)}[shadow.region_id]
+    assert status is (RegionStatus.RESOLVED if is_wall_seen else RegionStatus.RESCANNED)
 
 
 def test_unreachable_is_said_with_a_reason_and_an_old_report_changes_nothing() -> None:
