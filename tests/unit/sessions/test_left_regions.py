@@ -82,16 +82,16 @@ def scanned(tmp_path):
 
 
 def _list_a_wall_that_no_later_report_has(session):
-    """A report with one region more: a wall through the middle of the plate, where nothing is measured."""
+    """A report with one region more: a high wall through the middle of the plate, where nothing is measured."""
     results = session.results()
     wall = RescanRegion(
         number=1,
         reason=Reason.SHADOW,
         outline_mm=(
-            np.array([[x, y, z] for x, z in ((-1.0, 0.0), (1.0, 0.0), (1.0, 9.0), (-1.0, 9.0)) for y in (0.0,)]),
+            np.array([[x, y, z] for x, z in ((-1.0, 0.0), (1.0, 0.0), (1.0, 40.0), (-1.0, 40.0)) for y in (0.0,)]),
         ),
         area_mm2=18.0,
-        centroid_mm=np.array([0.0, 0.0, 4.5]),
+        centroid_mm=np.array([0.0, 0.0, 20.0]),
         normal=np.full(3, math.nan),
         measured_per_mm2=0.0,
         required_per_mm2=math.nan,
