@@ -15,6 +15,8 @@ _LOW, _HIGH = 1.0, 99.0
 _LEAST_SPAN = 0.25
 """The scale reaches at least so much beyond what is required, on both sides, as a share of it."""
 
+_NOTHING_PER_MM2 = 1e-9  # no density that is worth a digit
+
 
 @dataclass(frozen=True, slots=True)
 class DensityScale:
@@ -48,8 +50,8 @@ def scale_of(densities_per_mm2: Float64Array, required_per_mm2: float = float("n
 
 
 def _two_digits(value: float, towards: np.ufunc) -> float:
-    """The next number of two digits, below or above; 0 below the smallest of them."""
-    if not value > 0.0:
+    """The next number of two digits, below or above; 0 for what is as good as nothing."""
+    if not value > _NOTHING_PER_MM2:
         return 0.0
     unit = 10.0 ** (np.floor(np.log10(value)) - 1.0)
     return float(towards(round(value / unit, 6)) * unit)

@@ -18,9 +18,12 @@ export function outcome(status, regions) {
 }
 
 export class JudgingNote {
+  #isAsked = false; // somebody asked for it, and has no answer yet
   #isAwaited = false;
-  #isThere = false; // the verdict that was awaited last
+  #isThere = false; // the verdict that was awaited last, whose regions are not known yet
+  #hasFaded = false;
   #before = null; // the regions of the verdict before it
+  #told = null; // the status that was heard last
   #timer = null;
 
   // `regions()` tells those of the latest verdict.
@@ -30,26 +33,61 @@ export class JudgingNote {
 
   open() {
     clearTimeout(this.#timer);
-    this.#isAwaited = this.#isThere = false;
+    this.#isAsked = this.#isAwaited = this.#isThere = false;
+    this.#told = null;
     this.#show("", null);
   }
 
+  // Something else is asked for on this page; until `answered` no status says that its verdict is there.
+  ask() {
+    this.#begin();
+    this.#isAsked = true;
+    this.#show(`${WHY.asked_anew}…`, 0);
+  }
+
+  answered() {
+    this.#isAsked = false;
+    this.#isAwaited = true;
+    if (this.#told) this.status({ ...this.#told, judging: null });
+  }
+
   status(told) {
+    this.#told = told;
     if (told.judging) {
-      clearTimeout(this.#timer);
-      if (!this.#isAwaited) this.#before = this.regions();
+      if (!this.#isAwaited && !this.#isAsked) this.#begin();
       this.#isAwaited = true;
       this.#show(underWay(told.judging), told.judging.share);
       return;
     }
+    if (this.#isAsked) return;
     if (this.#isAwaited) {
-      this.#timer = setTimeout(() => this.open(), OUTCOME_MS);
+      this.#isAwaited = false;
       this.#isThere = true;
+      this.#fade();
     }
-    this.#isAwaited = false;
     if (!this.#isThere) return;
     const now = this.regions();
-    this.#show(outcome(told, now === this.#before ? null : now), null);
+    const isKnown = now !== null && now !== this.#before;
+    if (isKnown || !this.#hasFaded) this.#show(outcome(told, isKnown ? now : null), null);
+    if (!isKnown) return;
+    this.#isThere = false;
+    this.#fade();
+  }
+
+  #begin() {
+    clearTimeout(this.#timer);
+    this.#isThere = false;
+    this.#before = this.regions();
+  }
+
+  // The outcome goes when it was read; one whose regions come later is shown once more.
+  #fade() {
+    clearTimeout(this.#timer);
+    this.#hasFaded = false;
+    this.#timer = setTimeout(() => {
+      this.#hasFaded = true;
+      this.#show("", null);
+    }, OUTCOME_MS);
   }
 
   #show(text, share) {

@@ -55,8 +55,13 @@ const guide = new Guide(byId("guide"), (share) => {
 const passes = new PassesPanel({ trouble, scanned: () => session.open(session.id), onOrder: followOrder, onPass: (pass) => showPass(pass ?? ordered?.pass ?? null) });
 const judging = new JudgingNote(() => session.regions);
 const awaiting = {
+  onAsked: () => judging.ask(),
   onJudging: (told) => judging.status(told),
-  onJudged: () => connectionState === "finished" && session.open(session.id), // nothing more came by itself
+  onRefused: () => judging.open(),
+  onJudged: () => {
+    judging.answered();
+    if (connectionState === "finished") session.open(session.id); // nothing more comes by itself
+  },
 };
 const requirement = new RequirementPanel({ onInterest: showInterest, partBox, ...awaiting });
 const nominal = new NominalPart(awaiting);

@@ -6,10 +6,10 @@ import { bringFile, measureAgainst, whileJudged } from "./service.js";
 export class NominalPart {
   #id = null;
 
-  // onJudging(status) hears how far the verdict is that was asked for, onJudged() that it is there.
-  constructor({ onJudging, onJudged }) {
-    this.onJudging = onJudging;
-    this.onJudged = onJudged;
+  // onAsked() hears that a verdict is asked for, onJudging(status) how far it is, onJudged() that it is there, and
+  // onRefused() that there will be none.
+  constructor({ onAsked, onJudging, onJudged, onRefused }) {
+    Object.assign(this, { onAsked, onJudging, onJudged, onRefused });
     byId("nominal-bring").addEventListener("click", () => byId("nominal-file").click());
     byId("nominal-file").addEventListener("change", (event) => {
       const [file] = event.target.files;
@@ -45,9 +45,11 @@ export class NominalPart {
     try {
       const name = await bring();
       this.#say(name === null ? "judging without it…" : `judging by ${name}…`);
+      this.onAsked();
       await whileJudged(id, measureAgainst(id, name, byId("nominal-units").value), (told) => id === this.#id && this.onJudging(told));
       if (id === this.#id) this.onJudged();
     } catch (refusal) {
+      if (id === this.#id) this.onRefused();
       this.#refuse(refusal.message);
     } finally {
       byId("nominal-bring").disabled = false;

@@ -14,12 +14,12 @@ export class RequirementPanel {
   #inputs = new Map();
 
   // onInterest(box) hears of the box in the fields, {low_mm, high_mm} or null; partBox() tells how far the points reach;
-  // onJudging(status) hears how far the verdict is that was asked for, onJudged() that it is there.
-  constructor({ onInterest, partBox, onJudging, onJudged }) {
+  // onAsked() hears that a verdict is asked for, onJudging(status) how far it is, onJudged() that it is there, and
+  // onRefused() that there will be none.
+  constructor({ onInterest, partBox, onAsked, onJudging, onJudged, onRefused }) {
     this.onInterest = onInterest;
     this.partBox = partBox;
-    this.onJudging = onJudging;
-    this.onJudged = onJudged;
+    Object.assign(this, { onAsked, onJudging, onJudged, onRefused });
     const form = byId("requirement-form");
     byId("requirement-fields").append(...FIELDS.map((field) => this.#field(field)));
     byId("interest-fields").append(...CORNERS.map((corner) => this.#corner(corner)));
@@ -134,6 +134,7 @@ export class RequirementPanel {
     const apply = byId("requirement-apply");
     apply.disabled = true;
     apply.textContent = "Judging…";
+    this.onAsked();
     try {
       const { requirement } = await whileJudged(id, askFor(id, body), (told) => id === this.#id && this.onJudging(told));
       if (id !== this.#id) return;
@@ -142,6 +143,7 @@ export class RequirementPanel {
       this.onJudged();
     } catch (refusal) {
       if (id !== this.#id) return;
+      this.onRefused();
       this.#refuse(refusalsByField(refusal));
       apply.disabled = false;
     } finally {

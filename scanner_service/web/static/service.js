@@ -69,10 +69,13 @@ const LOOK_MS = 500;
 // What `request` answers; `onStatus` hears the session's status meanwhile and once more at its end, also where nothing is streamed any more.
 export async function whileJudged(id, request, onStatus) {
   let isAnswered = false;
-  const look = () => answer(`api/v1/sessions/${encodeURIComponent(id)}`).then(onStatus, () => {});
+  const look = (isLast) =>
+    answer(`api/v1/sessions/${encodeURIComponent(id)}`).then((told) => {
+      if (isLast || !isAnswered) onStatus(told); // what was under way when the answer came is of before
+    }, () => {});
   const watch = async () => {
     while (!isAnswered) {
-      await look();
+      await look(false);
       await new Promise((resolve) => setTimeout(resolve, LOOK_MS));
     }
   };
@@ -81,7 +84,7 @@ export async function whileJudged(id, request, onStatus) {
     return await request;
   } finally {
     isAnswered = true;
-    await look();
+    await look(true);
   }
 }
 
