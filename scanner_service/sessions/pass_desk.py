@@ -192,7 +192,7 @@ class PassDesk:
         order = self.order(order_id)
         if order.is_over:
             raise SessionBusy(f"pass order {order_id} is {order.status.value}: nobody needs guidance along it any more")
-        latest = self._session.latest_lines()
+        latest = self._session.hearing.latest_lines()
         if not latest:
             raise SessionBusy("no scanline has come yet: switch the scanner on and move it over the part")
         line, at_s = latest[-1]
