@@ -42,7 +42,7 @@ LINE_SPACING_MM = 0.2
 CONSTANT_MM = 0.1
 NOISE_MM = 0.01
 NOISY_FACTOR = 8.0
-CLOSELY_MM = 0.1  # distance of the samples that tell what is seen: a third of the radius, as the band wants it
+CLOSELY_MM = 0.1  # distance of the samples that tell what is seen: a quarter of the radius, as the band wants it
 ISOLATED = "isolated"
 MESHES = ("fandisk.obj", "gears.stl", "featuretype.STL")
 

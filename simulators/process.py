@@ -14,6 +14,7 @@ import signal
 import stat
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -164,8 +165,8 @@ def serve_simulated_scanner(
     if turntable:
         if kind != "native":
             raise UnknownDevice(f"{kind} reads no encoder: a turntable stands before a native scanner only")
-        table = Table()
-        stage_port = PtyPort(table, STAGE_BAUD_RATE)
+        table = Table(time.monotonic)
+        stage_port = PtyPort(table, STAGE_BAUD_RATE, clock=time.monotonic)
         actions |= {"unplug_stage": stage_port.unplug, "replug_stage": stage_port.replug, "stall": table.stall}
     if kind == "native":
         native_rate = DEFAULT_BAUD_RATE if baud_rate is None else baud_rate
@@ -203,7 +204,7 @@ def serve_simulated_scanner(
                 rig_file.write_text(rig_text(port.path, native_rate, stage_port.path))
         announce(event("ready") | extras)
         unread = b""
-        while not (stop.is_set() or port.has_failed):
+        while not (stop.is_set() or port.has_failed or (stage_port is not None and stage_port.has_failed)):
             if commands is None:
                 stop.wait(_LOOK_S)
                 continue
@@ -261,13 +262,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rig_file=given.rig_file,
             commands=_piped_input(),
         )
-    except (SimulatedPortError, MeshError, ValueError) as error:
-        print(f"simulators: {error}", file=sys.stderr)
-        return 1
     except BrokenPipeError:
         # The parent does not listen any more. Python would complain once more when it flushes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except (SimulatedPortError, MeshError, ValueError, OSError) as error:
+        print(f"simulators: {error}", file=sys.stderr)
+        return 1
     return 0
 
 

@@ -6,7 +6,6 @@ to the place of one. So lines lie where the table truly was, however late a busy
 
 import math
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -75,9 +74,10 @@ def stage_from_sensor() -> Pose:
 
 
 class Table:
-    """A rotary stage behind a Zaber controller, whose encoder another thread may read."""
+    """A rotary stage behind a Zaber controller, whose encoder another thread may read; `clock` is its terminal's."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
         self._lock = threading.Lock()
         self._zaber = ZaberDevice(limit_max=round(TURN_DEG[1] / MICROSTEP_DEG))
         self._zaber.settings["maxspeed"] = str(round(_HOMING_DEG_PER_S / MICROSTEP_DEG * 1.6384))
@@ -100,7 +100,7 @@ class Table:
     def stall(self) -> None:
         """Meet an obstacle, or be held by hand: it stands at once, and says so; homing it mends that."""
         with self._lock:
-            self._zaber.stall(time.monotonic())
+            self._zaber.stall(self._clock())
 
     def encoder_mm(self, now_s: float) -> float:
         """Where the table stands, in millimetres of arc."""

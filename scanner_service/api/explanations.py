@@ -133,7 +133,7 @@ EXPLANATIONS = {
         "There is no pass or order of that number.", "List the recommended passes, or the orders, again.", _DRIVE
     ),
     "plan-overtaken": Explanation(
-        "The map has changed since the plan was made, and its passes are numbered anew.",
+        "The plan was made for another map, requirement or rig, or for other regions: its numbers mean other passes.",
         "Ask for the plan again, and choose from that one.",
         _DRIVE,
     ),

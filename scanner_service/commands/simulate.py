@@ -52,8 +52,8 @@ def simulate_command(
         fail(f"there is no part {part}; the parts are {', '.join(sorted(PARTS))}")
     if rig_file is not None and not turntable:
         fail("a rig file puts a scanner and a turntable together: say --turntable too")
-    if turntable and mesh is not None:
-        fail("on the turntable stands a part of its own: leave out --mesh or --turntable")
+    if turntable and (mesh is not None or part != "demo"):
+        fail("on the turntable stands a part of its own: leave out --part and --mesh, or --turntable")
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())

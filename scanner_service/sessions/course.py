@@ -88,7 +88,8 @@ class Course:
                     self.time.stop()
                     self._state, self.message = before, said
             raise
-        self._write_state(self._state)
+        with self._change:
+            self._write_state(self._state)
 
     @contextlib.contextmanager
     def holding(self, message: str) -> Iterator[None]:
@@ -102,20 +103,25 @@ class Course:
         except BaseException:
             self._is_held = False
             raise
-        if self._state == "scanning":
-            self.hold(message)
-        else:
-            self._is_held = False
+        with self._change:
+            if self._state == "scanning":
+                self.hold(message)
+            else:
+                self._is_held = False
 
-    def released(self) -> None:
-        """A pause that was held is over."""
+    def release(self) -> None:
+        """A pause that was held is over, and lines flow again: at once, so that none looks like a scanner's return."""
         with self._change:
             self._is_held = False
             self.time.start()
+            self.go_on()
 
     def begin_to_end(self) -> bool:
-        """No line is taken from now on; False when it has ended, or another thread ends it."""
-        with self._change:
+        """No line is taken from now on; False when it has ended, or another thread ends it.
+
+        Waits for the turn: what is just being started has started then, or never does.
+        """
+        with self.turn, self._change:
             if self.has_ended or self._is_ending:
                 return False
             self._is_ending = True
@@ -127,9 +133,10 @@ class Course:
     def hold(self, message: str) -> None:
         """The scan stands until somebody resumes it."""
         with self._change:
-            self._is_held = True
-            self.time.stop()
-        self.wait_for_return(message)
+            if self._may_move:
+                self._is_held = True
+                self.time.stop()
+                self.wait_for_return(message)
 
     def wait_for_return(self, message: str) -> None:
         """The scan stands until its scanner is back."""
@@ -140,9 +147,14 @@ class Course:
         if not self._is_held:
             self._move("scanning", None)
 
+    @property
+    def _may_move(self) -> bool:
+        """False when it is over, or about to be: what a source says then changes nothing of that."""
+        return self.is_under_way and not self._is_ending
+
     def _move(self, state: str, message: str | None) -> None:
         with self._change:
-            if not self._is_ending:
+            if self._may_move:
                 self._state, self.message = state, message
                 self._write_state(state)
 

@@ -192,7 +192,7 @@ class PassDesk:
         order = self.order(order_id)
         if order.is_over:
             raise SessionBusy(f"pass order {order_id} is {order.status.value}: nobody needs guidance along it any more")
-        latest = self._session.latest_lines()
+        latest = self._session.hearing.latest_lines()
         if not latest:
             raise SessionBusy("no scanline has come yet: switch the scanner on and move it over the part")
         line, at_s = latest[-1]
@@ -352,7 +352,7 @@ class PassDesk:
                 _LOG.info("region %d was not marked: %s", region.region_id, error)
 
     def _learn(self, order: PassOrder) -> None:
-        """Take in where the sensor stands after a pass, and what it was in vain for.
+        """Take in where the sensor stands after a pass, and what it was in vain for; the lock is held.
 
         A pass that failed or was stopped was in vain for nothing, and where it ended is not known.
         """
@@ -361,6 +361,7 @@ class PassDesk:
             self._standing = order.planned.end_pose
         elif order.status in (PassStatus.DONE, PassStatus.FAILED):
             self._standing = None
+        self._changed()
 
     def _follow(self, order: PassOrder, before: Results, setup: RigSetup) -> None:
         """The thread of one pass: wait for its end, then say what it brought."""
@@ -375,16 +376,16 @@ class PassDesk:
                 taken = np.isin(after.snapshot.lines.pass_number, order.map_passes) & ~after.snapshot.lines.stationary
                 laser_mm = setup.optics.geometry.laser_mm
                 order.reached_end = reaches_end(order.planned, laser_mm, after.snapshot.lines.laser_mm[taken])
-                self._changed()
                 failed = self._session.state == "failed"
                 order.message = self._session.status().message if failed else None
                 order.status = PassStatus.FAILED if failed else PassStatus.DONE
+                self._learn(order)
         except Exception as error:  # noqa: BLE001 - the thread's end: whoever waits for the order must be told
             _LOG.exception("pass order %d of session %s", order.order_id, self._session.row.session_id)
-            order.message, order.status = str(error), PassStatus.FAILED
-        try:
             with self._lock:
+                order.message, order.status = str(error), PassStatus.FAILED
                 self._learn(order)
+        try:
             self._session.event(OUTCOME, outcome_event(order))
         finally:
             self._task(-1)

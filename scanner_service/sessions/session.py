@@ -204,7 +204,7 @@ class LiveSession:
     def _judge_anew(self) -> None:
         with self._awaited.awaited("asked_anew") as begins:
             self._judgement.renew(self.source, begins=begins)
-        if self._course.has_ended:  # what the scan left was of the verdict before
+        if self._course.is_ending or self._course.has_ended:  # what the scan left may be of the verdict before
             self._judgement.write_regions_down()
 
     @property
@@ -243,15 +243,18 @@ class LiveSession:
             if not self._course.is_held or not isinstance(self.source, Pausable):
                 raise SessionBusy("the scanner is gone; the session goes on, or can be resumed, when it is back")
             self.source.resume()
-            self._course.released()
-            self.hearing.note("resumed", {"by": "request"})
+            self.event("resumed", {"by": "request"})
+            self._course.release()
         self._chronicle.settle()
 
     def stop(self) -> None:
         """End the scan: close the source and the passes, judge what there is; idempotent."""
         if self._course.is_under_way or self.state == "created":
-            self.source.stop()
-            self._finish(None)
+            self.source.stop()  # one that is just being started does not wait for its turn to end
+            if self._course.begin_to_end():
+                self._end(None, stops=True)
+            else:
+                self._course.wait_for_the_other()
 
     def close(self) -> None:
         """Let go of everything; a session that is scanning is stopped first."""
@@ -263,6 +266,7 @@ class LiveSession:
         finally:
             self._closing.set()
             self._analyst.join()
+            self._chronicle.ledger(self.losses(), self.elapsed_s())  # its last one may be older than that of the end
             self._chronicle.close()
             self.engine.close()
 
@@ -284,10 +288,6 @@ class LiveSession:
     def read_page(self, changes: Changes, start: int, count: int) -> "Future[PointPage]":
         """What is said of the changed points from number `start` on, at most `count` of them."""
         return self.engine.ask_between(lambda engine: read_page(engine.live_map, self.verdicts, changes, start, count))
-
-    def latest_lines(self) -> list[tuple[Scanline, float]]:
-        """The last few scanlines with the seconds at which they came, the oldest first."""
-        return self.hearing.latest_lines()
 
     def event(self, kind: str, details: dict[str, Any]) -> None:
         """Put an event into the session's record."""
@@ -353,20 +353,20 @@ class LiveSession:
     # -- inside -------------------------------------------------------------------------------------------------
 
     def _finish(self, failure: str | None) -> None:
-        """End the scan, unless another thread does: then wait until it has."""
-        with self._course.turn:
-            is_ours = self._course.begin_to_end()
-        if is_ours:
+        """End the scan from the source's own thread, unless another does, which may be waiting for this one."""
+        if self._course.begin_to_end():
             self._end(failure)
-        else:
-            self._course.wait_for_the_other()
 
-    def _end(self, failure: str | None) -> None:
+    def _end(self, failure: str | None, stops: bool = False) -> None:
         """Close the passes and judge for the last time; the state changes when the verdict is there.
+
+        `stops`: the source too, which may have started, or taken the place of another, since it was told to stop.
 
         An engine that was ended by a fault can do neither: then the session has failed, with what was judged before.
         """
         try:
+            if stops:
+                self.source.stop()
             with self._awaited.awaited("scan_ended") as begins:
                 self._course.wait_for_lines()
                 try:

@@ -74,11 +74,18 @@ def told(book, session, kind):
     return found.count(kind)
 
 
-def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
+def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned, monkeypatch):
     session, posed = scanned
     desk = book.pass_desk(session)
     desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     plan = desk.plan()
+    learn, half_known = desk._learn, []
+
+    def planned_before(order):
+        half_known.append(desk.plan())
+        learn(order)
+
+    monkeypatch.setattr(desk, "_learn", planned_before)
     order = desk.accept(plan.passes[0].number)
     assert order.status is PassStatus.ACCEPTED
     desk.carry_out(order.order_id)
@@ -96,6 +103,7 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned):
     assert order.outcome.reached_mm2 > 0.7 * order.outcome.promised_mm2
     assert desk.plan().version > plan.version
     assert desk.plan().needed_mm2 < plan.needed_mm2
+    assert name_of(desk.plan()) != name_of(half_known[0])  # where the sensor stands was not known then
     assert told(book, session, "pass_outcome") == 1
     assert [kind for kind in kinds(book, session) if kind.startswith("pass_")] == [
         "pass_accepted",

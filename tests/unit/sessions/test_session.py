@@ -14,6 +14,7 @@ from scanner_service.sessions.ledger import Ledger
 from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec
+from scanner_service.sessions.wires import Wires
 from scanner_service.sessions.withdrawals import SCAN_ENDED
 from scanner_service.storage.errors import CreationKeyReused, SessionUnknown
 from scanner_service.storage.reader import RecordReader
@@ -295,6 +296,32 @@ def test_a_source_is_stopped_when_the_engine_has_broken_down(book):
     session.start()
     assert session.wait_until_over(30)
     assert session.state == "failed"
+
+
+def test_a_pass_that_is_just_being_set_off_is_stopped_as_well(book, monkeypatch, aside):
+    session = replay(book, LINES)
+    known, follow, stopped, stopping = session.source, Wires.followed_by, threading.Event(), []
+    monkeypatch.setattr(known, "stop", stopped.set)
+
+    def stopped_meanwhile(wires, source):
+        stopping.append(aside(session.stop))
+        assert stopped.wait(60)  # the source before; the further one is not there yet
+        return follow(wires, source)
+
+    monkeypatch.setattr(Wires, "followed_by", stopped_meanwhile)
+    is_over = threading.Event()
+
+    def lines():
+        while not is_over.is_set():
+            yield LINES[0]
+
+    further = ReplaySource(lines(), 1)
+    session.carry_out(lambda: further)
+    stopping[0].result(60)
+    assert session.state == "stopped"
+    plays_on = further._thread.is_alive()
+    is_over.set()
+    assert not plays_on
 
 
 def test_a_line_pushed_after_the_stop_is_refused(book):
