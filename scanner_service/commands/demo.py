@@ -84,7 +84,8 @@ def demo_command(
             regions = _checked(client.get(f"/api/v1/sessions/{session_id}/regions")).json()["regions"]
             tell(regions, summary, out)
         if keep:
-            errors.print("Serving on; Ctrl-C ends it.")
+            viewer = login_url(service.access, listening.url)
+            errors.print(f"Serving on until Ctrl-C; once more the viewer: {viewer}", soft_wrap=True, highlight=False)
             with contextlib.suppress(KeyboardInterrupt):
                 while True:
                     time.sleep(3600.0)

@@ -56,10 +56,13 @@ def _follow(client: httpx.Client, where: str, arm: "SimulatedArm") -> str:
             number, status = order["order"], order["status"]
             if status == "running" and number not in carried:
                 carried.add(number)
+                _tell(f"pass {number} is under way: {order['pass']['lines']} lines")
                 arm.carry_out(order)
             elif status not in ("accepted", "running") and number not in told:
                 told.add(number)
                 _tell(f"{_said(order)}; {_coverage(client, where)}")
+                if loop["running"]:
+                    _tell("planning the next pass")
         if not loop["running"]:
             return str(loop["why_ended"])
         time.sleep(_POLL_S)

@@ -28,6 +28,10 @@ def rescan_command(
     reason: Annotated[list[str] | None, typer.Option("--reason", help="Serve this reason; repeatable.")] = None,
     max_passes: Annotated[int, typer.Option(min=1, max=200, help="Most passes of --auto.")] = 20,
     max_seconds: Annotated[float, typer.Option(min=1.0, help="Most seconds of passes of --auto.")] = 600.0,
+    coverage: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=1.0, help="Coverage that ends --auto; that of the requirement by default."),
+    ] = None,
     data: Data = DEFAULT_DATA,
     url: Annotated[str, typer.Option(help="Where the service listens.")] = "http://127.0.0.1:8765",
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
@@ -45,7 +49,7 @@ def rescan_command(
         with running_service(data, url) as client:
             where = f"/api/v1/sessions/{named(client, session)}"
             if auto:
-                limits = {"max_passes": max_passes, "max_seconds": max_seconds}
+                limits = {"max_passes": max_passes, "max_seconds": max_seconds, "coverage_share": coverage}
                 chosen = {"regions": serving["region"], "reasons": serving["reason"]}
                 result = _loop(client, where, limits | chosen, as_json)
             elif carry_out is not None and plan is not None:

@@ -109,8 +109,8 @@ def wanted_of(plan: Plan, number: int, seen: str | None) -> RecommendedPass:
     """
     if seen is not None and seen != name_of(plan):
         raise PlanOvertaken(
-            f"this plan is no longer in force: map, requirement, rig or what is to be served is not what plan {seen} "
-            "was made for; list the passes again"
+            f"plan {seen} is not in force, the plan now is {name_of(plan)}: map, requirement, rig or what is to be "
+            "served may have changed since it was made; list the passes again"
         )
     wanted = next((one for one in plan.passes if one.number == number), None)
     if wanted is None:

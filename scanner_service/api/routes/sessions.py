@@ -240,13 +240,14 @@ def delete_reference(session: Session) -> Response:
 
 
 def _requirement_answer(session: LiveSession) -> dict[str, Any]:
-    status = session.status()
+    status, results = session.status(), session.results()
     return {
         "requirement": requirement_told(session.settings.target),
         "reference": session.row.settings.get("reference"),
         "holds": status.holds,
         "coverage": status.coverage,
         "coverage_kind": status.coverage_kind,
+        "reference_refused": None if results is None else results.reference_refused,
     }
 
 

@@ -43,7 +43,9 @@ def keep_pass(one: RecommendedPass) -> dict[str, Any]:
         ],
         "columns": _COLUMNS,
         "places": base64.b64encode(rows.astype("<f4").tobytes()).decode("ascii"),
-        "turn": None if one.turn is None else [one.turn.about_vertical_rad, one.turn.tip_rad],
+        "turn": None
+        if one.turn is None
+        else [one.turn.about_vertical_rad, one.turn.tip_rad, *(one.turn.about_mm or ())],
         "chances": list(one.learned.chances),
         "spreads": list(one.learned.spreads),
     }
@@ -90,7 +92,7 @@ def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
         place_regions=rows[:, 8].copy(),
         place_evidence=evidence,
         place_tried=rows[:, 10] > 0 if columns == _COLUMNS else former,
-        turn=None if turn is None else PartTurn(float(turn[0]), float(turn[1])),
+        turn=None if turn is None else _kept_turn([float(value) for value in turn]),
         learned=learned,
         **numbers,
     )
@@ -101,6 +103,12 @@ def _by_kind(kept: Sequence[Any], first: tuple[float, ...]) -> tuple[float, ...]
     if len(kept) > len(Evidence):
         raise ValueError(f"a kept pass tells of {len(kept)} kinds of evidence, and there are {len(Evidence)}")
     return (*map(float, kept), *first[len(kept) :])
+
+
+def _kept_turn(turn: list[float]) -> PartTurn:
+    if len(turn) not in (2, 5):
+        raise ValueError(f"a turn of the part has two angles, and a point since that is kept, not {len(turn)} numbers")
+    return PartTurn(turn[0], turn[1], None if len(turn) == 2 else (turn[2], turn[3], turn[4]))
 
 
 def keep_motion(motion: Motion) -> dict[str, Any]:

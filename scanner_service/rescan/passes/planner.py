@@ -107,6 +107,8 @@ def plan_passes(
             break
         prospect = prospect_of(surface, every, choice.motion, optics) if every is not needs else choice.prospect
         served = left & _served_by(choice.stretch, prospect)
+        if not served.any():  # by all places there is nothing of what it was chosen for
+            continue
         left &= ~served
         one = _recommend(len(passes) + 1, choice, every, prospect, served, reach, standing, wishes)
         passes.append(one)

@@ -22,11 +22,13 @@ _PART_TIPS_DEG = (0.0, 30.0, 50.0)
 class PartTurn:
     """How the operator turns the part on a rig whose sensor cannot: about the vertical, then over towards +y.
 
-    Angles by the right-hand rule, seen from the rig; the middle of the part stays where it is.
+    Angles by the right-hand rule, seen from the rig; the point `about_mm` (part frame) stays where it is, None in
+    passes of a time when it was not kept.
     """
 
     about_vertical_rad: float
     tip_rad: float
+    about_mm: tuple[float, float, float] | None = None
 
     @property
     def is_none(self) -> bool:
@@ -44,7 +46,14 @@ class PartTurn:
             said.append(f"turn the part by {math.degrees(self.about_vertical_rad):.0f}° (counter-clockwise from above)")
         if self.tip_rad:
             said.append(f"tip it over by {math.degrees(self.tip_rad):.0f}° towards the end of the travel")
-        return ", then ".join(said) or "leave the part as it lies"
+        if not said:
+            return "leave the part as it lies"
+        stays = (
+            ""
+            if self.about_mm is None
+            else "; the point {:.0f}, {:.0f}, {:.0f} mm stays in its place".format(*self.about_mm)
+        )
+        return ", then ".join(said) + stays
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,10 +225,12 @@ class Reach:
         """The linear axis as it is, and with the part turned before it."""
         at_zero = self.rig.part_from_sensor(0.0)
         travel = self.rig.part_from_stage.rotate(self.rig.travel_stage)
+        middle_mm = np.round(middle_mm)  # so that it can be said
+        x, y, z = (float(value) for value in middle_mm)
         turns = [PartTurn(0.0, 0.0)]
         if self.part_may_turn:
             turns += [
-                PartTurn(math.radians(about), math.radians(tip))
+                PartTurn(math.radians(about), math.radians(tip), (x, y, z))
                 for tip in _PART_TIPS_DEG
                 for about in _PART_TURNS_DEG
                 if (about, tip) != (0.0, 0.0)

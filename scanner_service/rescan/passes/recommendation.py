@@ -156,6 +156,7 @@ class RecommendedPass:
             "direction": self.direction.tolist(),
             "laser_direction": (-self.start_pose.rotation[:, 2]).tolist(),
             "turn_part": None if self.turn is None or self.turn.is_none else str(self.turn),
+            "turn_about_mm": None if self.turn is None or self.turn.about_mm is None else list(self.turn.about_mm),
             "gain_mm2": self.gain_mm2,
             "promised_mm2": promised.mm2,
             "promised_between_mm2": promised.between_mm2,

@@ -147,7 +147,7 @@ def test_a_pass_is_accepted_of_the_plan_that_was_seen_or_not_at_all(book, scanne
     desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))  # planned anew, with the same result: what was seen holds
     assert desk.accept(2, seen=name_of(seen)).planned.to_dict() == seen.passes[1].to_dict()
     desk.describe_rig(RigSetup(linear_reach(), OPTICS))
-    with pytest.raises(PlanOvertaken, match=r"no longer in force.*list the passes again"):
+    with pytest.raises(PlanOvertaken, match=r"is not in force.*list the passes again"):
         desk.accept(1, seen=name_of(seen))
     with pytest.raises(PlanOvertaken):
         desk.accept(1, Serving(reasons=frozenset({Reason.SPARSE})), name_of(seen))

@@ -147,7 +147,7 @@ def test_every_attitude_of_a_free_rig_is_allowed_and_right_handed():
 
 
 def test_turning_the_part_is_the_sensor_going_round_it():
-    turn = PartTurn(math.radians(90.0), math.radians(30.0))
+    turn = PartTurn(math.radians(90.0), math.radians(30.0), (0.0, 20.0, 0.0))
     middle = np.array([0.0, 20.0, 0.0])
     attitudes = linear_reach(part_may_turn=True).attitudes(middle)
     attitude = next(one for one in attitudes if one.turn == turn)
@@ -155,7 +155,7 @@ def test_turning_the_part_is_the_sensor_going_round_it():
     moved = turn.rotation @ (place - middle) + middle  # where it lies, seen from the rig, once the part is turned
     pose = attitude.motion.part_from_sensor(17.0)
     assert pose.inverse().apply(place) == pytest.approx(moved - np.array([0.0, 17.0, 0.0]), abs=1e-9)
-    assert "turn the part by 90°" in str(turn)
+    assert "turn the part by 90°" in str(turn) and str(turn).endswith("the point 0, 20, 0 mm stays in its place")
 
 
 def test_the_field_of_view_is_measured_from_the_points():

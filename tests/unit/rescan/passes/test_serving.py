@@ -114,6 +114,8 @@ def test_a_kept_pass_is_the_pass_that_was_kept(coarse):
     assert told == expected
     assert again.places_mm == pytest.approx(one.places_mm, abs=1e-4)
     assert again.place_mm2.sum() == pytest.approx(one.place_mm2.sum(), rel=1e-5)
+    before = kept_pass(keep_pass(one) | {"turn": [0.5, 0.0]})  # of a time when the point that stays was not kept
+    assert before.turn is not None and (before.turn.about_vertical_rad, before.turn.about_mm) == (0.5, None)
     turning = dataclasses.replace(one, motion=TurningMotion(one.motion.at_zero, np.array([0.0, 0.0, 1.0]), 20.0))
     motion = kept_pass(keep_pass(turning)).motion
     assert isinstance(motion, TurningMotion) and motion.radius_mm == 20.0
@@ -144,6 +146,7 @@ def test_a_pass_of_an_older_record_opens_with_what_nobody_kept_then_as_it_is_at_
         ("columns", 7),
         ("columns", 0),
         ("spreads", [0.1] * 9),
+        ("turn", [0.1, 0.2, 3.0]),
     ],
 )
 def test_what_was_not_kept_so_is_refused(coarse, name, value):
