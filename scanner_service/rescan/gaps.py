@@ -9,7 +9,7 @@ of the fan in the scanlines of a pass. Between the two ends A and B of such a pa
   laser's shadow runs along the laser's ray;
 - a *flank*: the same, but three pairs or more in a row jump in the same sense, or neither end has a plane, or the plane
   of one leads to the other (of both, where that is more than six radii away): steep surface;
-- *filled*: a shadow of one pass, whose wall and floor another pass has seen (`filled.py`);
+- *filled*: a shadow of one pass, whose hidden surface other passes have seen (`filled.py`);
 - *out of range*: both ends stand near an end of the measurement range;
 - a *hole*: anything else. An inner border of the part, or dropouts: not a reason by itself. So is a jump over places
   without a return to a lone return from which the surface rises again at once: the far wall of a hole; and, without

@@ -22,7 +22,7 @@ from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.boxes import Boxes, boxes_of
 from scanner_service.rescan.columns import Columns
 from scanner_service.rescan.excerpt import excerpt_of, rows_of_lines
-from scanner_service.rescan.filled import SIGHT, seen_by_others
+from scanner_service.rescan.filled import seen_by_others, sight_mm
 from scanner_service.rescan.frames import Frames, angle_and_depth, frames_of
 from scanner_service.rescan.gaps import (
     Fan,
@@ -230,7 +230,7 @@ class PointVerdicts:
                 middle, half = 0.5 * (start + end), 0.5 * np.linalg.norm(end - start, axis=1)
                 high, low = np.where(is_down, first, second)[shadow], np.where(is_down, second, first)[shadow]
                 news = boxes_of(snapshot.points_mm[changed], np.arange(len(changed)), len(changed))
-                around = Boxes(middle, middle).grown(SIGHT * half)
+                around = Boxes(middle, middle).grown(sight_mm(half, snapshot.radius_mm[low]))
                 asked = is_new[second[shadow]] | around.meet(news)
                 rows = shadow[asked]
                 near = np.flatnonzero(self._boxes.meet(around.part(asked)))
