@@ -19,6 +19,7 @@ UNUSED_S = 30 * 24 * 3600.0
 """A cache that was not used for so long is removed."""
 
 _CACHE = re.compile(r"kernels-[0-9a-f]{16}")
+_SUFFIX = ".going-"
 _GOING = re.compile(r"kernels-[0-9a-f]{16}\.going-\d+")
 
 
@@ -50,7 +51,8 @@ def remove_unused(own: Path | None = None, now_s: Callable[[], float] = time.tim
         beside = [each for each in own.parent.iterdir() if each.name != own.name]
     except OSError:
         return []
-    return [each.name for each in beside if _is_unused(each, now_s()) and _remove(each)]
+    gone = [each.name for each in beside if _is_unused(each, now_s()) and _remove(each)]
+    return [name.partition(_SUFFIX)[0] for name in gone]  # of what another began to remove as well
 
 
 def _is_unused(folder: Path, now_s: float) -> bool:
@@ -63,7 +65,7 @@ def _is_unused(folder: Path, now_s: float) -> bool:
 
 
 def _remove(folder: Path) -> bool:
-    going = folder if _GOING.fullmatch(folder.name) else folder.with_name(f"{folder.name}.going-{os.getpid()}")
+    going = folder if _GOING.fullmatch(folder.name) else folder.with_name(f"{folder.name}{_SUFFIX}{os.getpid()}")
     try:
         folder.rename(going)
         shutil.rmtree(going)
