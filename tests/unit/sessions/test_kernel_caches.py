@@ -37,7 +37,10 @@ def test_only_caches_that_nobody_used_for_long_are_removed(tmp_path):
     before = {each.name for each in tmp_path.iterdir()}
     gone = unused(own)
     assert sorted(gone) == ["kernels-00000000000000aa", "kernels-00000000000000cc"]
-    assert {each.name for each in tmp_path.iterdir()} == before - {"kernels-00000000000000aa", "kernels-00000000000000cc.going-7"}
+    assert {each.name for each in tmp_path.iterdir()} == before - {
+        "kernels-00000000000000aa",
+        "kernels-00000000000000cc.going-7",
+    }
     assert (elsewhere / "part" / "kernel.nbi").exists()
 
 
