@@ -22,7 +22,6 @@ from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.boxes import Boxes, boxes_of
 from scanner_service.rescan.columns import Columns
 from scanner_service.rescan.excerpt import excerpt_of, rows_of_lines
-from scanner_service.rescan.filled import seen_by_others, sight_mm
 from scanner_service.rescan.frames import Frames, angle_and_depth, frames_of
 from scanner_service.rescan.gaps import (
     Fan,
@@ -32,6 +31,7 @@ from scanner_service.rescan.gaps import (
     find_pairs,
     gaps_between,
     marks_of,
+    seen_by_others,
 )
 from scanner_service.rescan.judgement import Judgement, asked_of_the_first_pass, judge
 from scanner_service.rescan.partners import partners
@@ -228,14 +228,13 @@ class PointVerdicts:
                 is_new[changed] = True
                 start, end = snapshot.points_mm[first[shadow]], snapshot.points_mm[second[shadow]]
                 middle, half = 0.5 * (start + end), 0.5 * np.linalg.norm(end - start, axis=1)
-                high, low = np.where(is_down, first, second)[shadow], np.where(is_down, second, first)[shadow]
                 news = boxes_of(snapshot.points_mm[changed], np.arange(len(changed)), len(changed))
-                around = Boxes(middle, middle).grown(sight_mm(half, snapshot.radius_mm[low]))
+                around = Boxes(middle, middle).grown(0.9 * half)
                 asked = is_new[second[shadow]] | around.meet(news)
                 rows = shadow[asked]
                 near = np.flatnonzero(self._boxes.meet(around.part(asked)))
                 others = rows_of_lines(snapshot, near)
-                filled[rows] = seen_by_others(snapshot, stations, high[asked], low[asked], others)
+                filled[rows] = seen_by_others(snapshot, stations, first[rows], second[rows], others)
                 self._columns.put(second[rows], **{f"filled.{side}": filled[rows]})
                 kind[filled & (kind == GapKind.SHADOW)] = GapKind.FILLED
             ends.append((first, second, kind, is_down))

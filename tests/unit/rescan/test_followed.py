@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scanner_service.rescan.coverage import observed_coverage
 from scanner_service.rescan.followed import RegionBook
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.region import RegionStatus
@@ -123,24 +122,6 @@ def test_a_shadow_is_resolved_once_what_it_hides_is_seen_and_not_by_the_floor_al
     _followed(book, seen, 2)
     status = {region.region_id: region.status for region in (*book.current, *book.resolved)}[shadow.region_id]
     assert status is (RegionStatus.RESOLVED if is_wall_seen else RegionStatus.RESCANNED)
-
-
-@pytest.mark.parametrize(("wall", "floor"), [(True, False), (False, True), (True, True)])
-def test_a_shadow_counts_until_both_its_wall_and_its_floor_are_seen(wall: bool, floor: bool) -> None:
-    """Whatever one of the two alone brings, the verdict and the observed coverage still tell of the other."""
-    scan = triangulated(_raised_cliff, X, Y, 0.3)
-    if wall:
-        scan = scan.joined(_wall_from_before(np.arange(0.6, 6.3, 0.3)))
-    if floor:
-        scan = scan.joined(straight_down(_raised_cliff, X, np.arange(3.6, 6.9, 0.3), 0.3, pass_number=3))
-    snapshot = snapshot_of(scan)
-    report = find_regions(snapshot)
-    shadow_mm2 = sum(region.area_mm2 for region in report.regions if region.reason is Reason.SHADOW)
-    coverage = observed_coverage(snapshot, report)
-    if wall and floor:
-        assert shadow_mm2 == 0 and coverage.gap_mm2 < 1.0
-    else:
-        assert shadow_mm2 > 40.0 and coverage.gap_mm2 > 40.0
 
 
 def test_unreachable_is_said_with_a_reason_and_an_old_report_changes_nothing() -> None:
