@@ -50,7 +50,6 @@ _UNEVEN_MM = 0.5  # unevenness of a surface is no longer than this
 _DIRECTIONS = 48
 _FAR_MM = 25.0  # how far a shadow's surface looks for the space beside it, in small steps to the first light
 _STEPS = (0.02, 0.04, 0.06, 0.08, 0.11, 0.15, 0.2, 0.28, 0.4, 0.55, 0.75, 0.95)
-REASONS = ("steep", "sparse", "lost_lines", "out_of_range", "shadow", "noisy")
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,12 @@ AIR = 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def first_stop(state, low, cell, x, y, z, dx, dy, dz, start, end):
-    """Distance along a ray at which it enters a cell that is HIDDEN or SURFACE; inf when none does before `end`."""
+def enter_cells(low, cell, x, y, z, dx, dy, dz, start):
+    """A ray that goes from cell to cell (Amanatides and Woo 1987), at `start` mm of its way from x, y, z.
+
+    Its cell, the sign of a step along each axis, and how far apart borders of cells are along the ray, then how far
+    from `start` the next one is, axis by axis.
+    """
     x, y, z = (x + start * dx - low[0]) / cell, (y + start * dy - low[1]) / cell, (z + start * dz - low[2]) / cell
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
     si, sj, sk = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
@@ -22,6 +26,13 @@ def first_stop(state, low, cell, x, y, z, dx, dy, dz, start, end):
     mi = ((i + 1 - x) if si > 0 else (x - i)) * ti if dx != 0 else np.inf
     mj = ((j + 1 - y) if sj > 0 else (y - j)) * tj if dy != 0 else np.inf
     mk = ((k + 1 - z) if sk > 0 else (z - k)) * tk if dz != 0 else np.inf
+    return i, j, k, si, sj, sk, ti, tj, tk, mi, mj, mk
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def first_stop(state, low, cell, x, y, z, dx, dy, dz, start, end):
+    """Distance along a ray at which it enters a cell that is HIDDEN or SURFACE; inf when none does before `end`."""
+    i, j, k, si, sj, sk, ti, tj, tk, mi, mj, mk = enter_cells(low, cell, x, y, z, dx, dy, dz, start)
     at = 0.0
     ni, nj, nk = state.shape
     while start + at < end:
@@ -71,15 +82,7 @@ def first_known(state, low, cell, lasers, way, enters, leaves, points, first, in
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mark(state, low, cell, x, y, z, dx, dy, dz, start, end, mark):
     """Write `mark` into the cells on a ray: FREE wherever no surface is, HIDDEN only where nothing is known."""
-    x, y, z = (x + start * dx - low[0]) / cell, (y + start * dy - low[1]) / cell, (z + start * dz - low[2]) / cell
-    i, j, k = math.floor(x), math.floor(y), math.floor(z)
-    si, sj, sk = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
-    ti = cell / abs(dx) if dx != 0 else np.inf
-    tj = cell / abs(dy) if dy != 0 else np.inf
-    tk = cell / abs(dz) if dz != 0 else np.inf
-    mi = ((i + 1 - x) if si > 0 else (x - i)) * ti if dx != 0 else np.inf
-    mj = ((j + 1 - y) if sj > 0 else (y - j)) * tj if dy != 0 else np.inf
-    mk = ((k + 1 - z) if sk > 0 else (z - k)) * tk if dz != 0 else np.inf
+    i, j, k, si, sj, sk, ti, tj, tk, mi, mj, mk = enter_cells(low, cell, x, y, z, dx, dy, dz, start)
     at = 0.0
     ni, nj, nk = state.shape
     while start + at < end:

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from scanner_service.rescan.passes.marching import HIDDEN, SURFACE
+from scanner_service.rescan.passes.marching import HIDDEN, SURFACE, enter_cells
 
 CLEAR = 3.0
 """Cells that a sight goes before anything is in its way: beside an inner edge the other wall begins that near, and
@@ -32,15 +32,7 @@ def _is_hidden(state, index, points, normals, low, cell, x, y, z, dx, dy, dz, st
     `index` (the grid's shape) is the row of `points`, `normals` (m, 3) that a cell of surface has; without one, or with
     the normal 0 of a wall that was seen from both sides, the whole cell stands in the way.
     """
-    px, py, pz = (x + start * dx - low[0]) / cell, (y + start * dy - low[1]) / cell, (z + start * dz - low[2]) / cell
-    i, j, k = math.floor(px), math.floor(py), math.floor(pz)
-    si, sj, sk = (1 if dx > 0 else -1), (1 if dy > 0 else -1), (1 if dz > 0 else -1)
-    ti = cell / abs(dx) if dx != 0 else np.inf
-    tj = cell / abs(dy) if dy != 0 else np.inf
-    tk = cell / abs(dz) if dz != 0 else np.inf
-    mi = ((i + 1 - px) if si > 0 else (px - i)) * ti if dx != 0 else np.inf
-    mj = ((j + 1 - py) if sj > 0 else (py - j)) * tj if dy != 0 else np.inf
-    mk = ((k + 1 - pz) if sk > 0 else (pz - k)) * tk if dz != 0 else np.inf
+    i, j, k, si, sj, sk, ti, tj, tk, mi, mj, mk = enter_cells(low, cell, x, y, z, dx, dy, dz, start)
     at = 0.0
     ni, nj, nk = state.shape
     while start + at < end:
