@@ -40,6 +40,7 @@ _INK, _SOFT, _LINE = "#1d232b", "#5b6572", "#d9dee4"
 _PICTURE_DPI = 220
 _POINT = 1 / 72
 _NEARLY_EMPTY = 0.35  # of a page
+_AS_TYPED = ("-liga",)  # an id that is copied from a page must be the id: no letters drawn as one
 _TIGHTER = (0.93, 0.87)  # closer than that the lines of a table can no longer be told apart
 
 
@@ -239,6 +240,8 @@ class _Book:
         facts = {"Title": f"{drawable(content.title)} – scan report", "Creator": content.software}
         with PdfPages(file, metadata={**facts, "CreationDate": _when(content.written)}) as pages:
             for page in self._pages:
+                for label in page.findobj(Text):
+                    label.set_fontfeatures(_AS_TYPED)
                 pages.savefig(page)
         return file.getvalue()
 
