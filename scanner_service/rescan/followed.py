@@ -2,20 +2,18 @@
 
 A region is known by the surface it covers, cut into cubes of a few radii. A new region takes the id of the old one it
 shares most cubes with, of the same reason first. An old region that no new one continues is *resolved* when all points
-on its cubes are settled, unless something of its points was not judged again; until then it keeps its status. A shadow
-over which a later pass went has to be shown: as long as most of its surface has no points, it is *rescanned*. Every
+on its cubes are settled, unless something of its points was not judged again; until then it keeps its status. Every
 change is a moment of its history. Knows no session and no record.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from drivers.scanline import BoolArray, Float64Array
+from drivers.scanline import BoolArray
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.judgement import REMEDIES, Reason
 from scanner_service.rescan.region import RegionMoment, RegionStatus, RescanRegion
@@ -26,11 +24,6 @@ _OVER = 0.1  # share of a region's cubes that a later pass must touch before the
 _MOST_MOMENTS = 64
 _KEPT_CUBES = 40
 _MOST_RESOLVED = 1000
-_SHOWN = 0.3  # share of a shadow's surface that has points near, from which on a verdict without it is believed
-_MOST_PLACES = 256
-_ALONG = (0.25, 0.5, 0.75)  # of the way from the rim of a shadow to its foot
-_BEHIND = 0.7  # of the way to the nearer end: what a shadow hides lies no further behind its straight surface
-_BEFORE = 0.5  # cosine: a point faces what lies before it
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +44,6 @@ class _Known:
     region: RescanRegion
     cubes: set[tuple[int, int, int]]
     passes: frozenset[int]  # that had points on it when it was found, or when it last counted as rescanned
-    places_mm: Float64Array = field(default_factory=lambda: np.zeros((0, 4)))  # of a shadow: see `_places_of`
 
 
 class RegionBook:
@@ -101,10 +93,6 @@ class RegionBook:
             if not surface.is_settled(old.cubes) or not surface.is_there(old.cubes, old.region):
                 kept[known_id] = old  # it waits for points to settle
                 continue
-            later = surface.passes_on(old.cubes) - old.passes
-            if (later or old.region.status is RegionStatus.RESCANNED) and not surface.shows(old):
-                kept[known_id] = self._still_bare(known_id, old, later, changes)
-                continue
             merged = [other for other, cubes in zip(ids, fresh, strict=True) if other and len(cubes & old.cubes)]
             why = f"is part of region {merged[0]} now" if merged else "its surface meets the requirement"
             self._resolved[known_id] = _stepped(known_id, old, RegionStatus.RESOLVED, why, self._version, changes)
@@ -127,10 +115,7 @@ class RegionBook:
         return changes
 
     def to_dict(self) -> dict[str, Any]:
-        """What a later book needs to go on with the same ids, as JSON; cubes are thinned to a few a region.
-
-        The surface of a shadow is kept as long as the shadow is not resolved: it has to be shown before that.
-        """
+        """What a later book needs to go on with the same ids, as JSON; cubes are thinned to a few a region."""
         entries = [
             {
                 "id": known_id,
@@ -139,7 +124,6 @@ class RegionBook:
                 "cubes": sorted(known.cubes)[:: max(1, len(known.cubes) // _KEPT_CUBES)],
                 "history": [moment.to_dict() for moment in known.region.history],
                 "line_spacing_mm": _number(known.region.line_spacing_mm),
-                "places_mm": known.places_mm.round(3).tolist() if known_id in self._known else [],
             }
             for known_id, known in (*self._known.items(), *self._resolved.items())
         ]
@@ -189,9 +173,7 @@ class RegionBook:
                 history=history,
                 line_spacing_mm=math.nan if spacing is None else float(spacing),
             )
-            known = _Known(
-                region, cubes, frozenset(map(int, entry["passes"])), _kept_places(entry.get("places_mm", ()))
-            )
+            known = _Known(region, cubes, frozenset(map(int, entry["passes"])))
             (book._resolved if last.status is RegionStatus.RESOLVED else book._known)[region.region_id] = known
         return book
 
@@ -201,7 +183,7 @@ class RegionBook:
         moment = RegionMoment(self._version, RegionStatus.OPEN, region.area_mm2, region.priority, "found")
         changes.append(Change(self._next, region.reason, moment))
         known = replace(region, number=self._next, region_id=self._next, history=(moment,))
-        return _Known(known, cubes, passes, _places_of(region))
+        return _Known(known, cubes, passes)
 
     def _continued(
         self,
@@ -223,17 +205,8 @@ class RegionBook:
             replace(region, number=known_id, region_id=known_id, status=old.region.status, history=old.region.history),
             cubes,
             passes | old.passes,
-            _places_of(region),
         )
         return _stepped(known_id, known, status, why, self._version, changes) if why else known
-
-    def _still_bare(self, known_id: int, old: _Known, later: frozenset[int], changes: list[Change]) -> _Known:
-        """A shadow that no verdict finds any more, although nothing was measured on most of its surface."""
-        if not later:
-            return old
-        why = "a later pass was over it, and most of its surface has no points still"
-        known = replace(old, passes=old.passes | later)
-        return _stepped(known_id, known, RegionStatus.RESCANNED, why, self._version, changes)
 
     def _matched(self, regions: Sequence[RescanRegion], fresh: list[set[tuple[int, int, int]]]) -> list[int]:
         """The id that each new region takes; 0: a new one."""
@@ -266,8 +239,6 @@ class _Surface:
 
     def __init__(self, snapshot: MapSnapshot) -> None:
         counted = np.flatnonzero(snapshot.neighbours > 0)
-        self._points_mm, self._normals = snapshot.points_mm[counted], snapshot.normals[counted]
-        self._radius_mm = float(np.median(snapshot.radius_mm[counted])) if len(counted) else 0.0
         self._cube = _cube_rows(snapshot.points_mm[counted])
         self._pass = snapshot.lines.pass_number[snapshot.line[counted]]
         self._open: BoolArray = ~snapshot.settled[counted]
@@ -294,30 +265,6 @@ class _Surface:
         """True when no point in the cubes waits."""
         return not any(self._open[rows].any() for rows in self._rows(cubes))
 
-    def shows(self, known: _Known) -> bool:
-        """True when enough of a shadow's surface has points; of other regions there have been points before.
-
-        A place has a point when one is near it, or when one further off, but nearer than the ends of the shadow,
-        faces it: what is hidden lies behind the straight surface from rim to foot.
-        """
-        if not len(known.places_mm):
-            return True
-        places, behind = known.places_mm[:, :3], known.places_mm[:, 3]
-        near = float(np.fmax(self._radius_mm, known.region.line_spacing_mm))
-        reach = np.fmax(near, behind)
-        low, high = (places - reach[:, None]).min(axis=0), (places + reach[:, None]).max(axis=0)
-        inside = ((self._points_mm >= low) & (self._points_mm <= high)).all(axis=1)
-        if not inside.any():
-            return False
-        around, normals = self._points_mm[inside], self._normals[inside]
-        found = cKDTree(around).query_ball_point(places, reach)
-        row = np.concatenate([np.asarray(rows, dtype=np.int64) for rows in found])
-        place = np.repeat(np.arange(len(places)), [len(rows) for rows in found])
-        way = places[place] - around[row]
-        away = np.linalg.norm(way, axis=1)
-        faces = np.einsum("ij,ij->i", way, normals[row]) >= _BEFORE * away  # False where there is no normal
-        return len(np.unique(place[faces | (away <= near)])) >= _SHOWN * len(places)
-
     def is_there(self, cubes: set[tuple[int, int, int]], region: RescanRegion) -> bool:
         """True when the cubes still hold points: a withdrawn pass resolves nothing. Untouched surface never had any."""
         return region.reason is Reason.UNTOUCHED or any(len(rows) for rows in self._rows(cubes))
@@ -334,38 +281,6 @@ def _stepped(known_id: int, old: _Known, status: RegionStatus, why: str, version
 def _cubes_of(snapshot: MapSnapshot, region: RescanRegion) -> set[tuple[int, int, int]]:
     points = [snapshot.points_mm[region.point_rows], *region.outline_mm]
     return {tuple(cube) for cube in np.unique(_cube_rows(np.concatenate(points)), axis=0).tolist()}
-
-
-def _places_of(region: RescanRegion) -> Float64Array:
-    """Places on a shadow's surface and how far behind it hidden surface may lie, (k, 4), mm; none of other regions.
-
-    A shadow's outline is its rim and, the other way round, its foot: one loop, or two when the rim is a ring.
-    """
-    if region.reason is not Reason.SHADOW or not region.outline_mm:
-        return np.zeros((0, 4))
-    if len(region.outline_mm) == 1:
-        rim, foot = np.array_split(region.outline_mm[0], 2)
-    else:
-        rim, foot = region.outline_mm[:2]
-    count = min(len(rim), len(foot))
-    rim, foot = rim[:count], foot[::-1][:count]
-    length = np.linalg.norm(foot - rim, axis=1)
-    places = np.concatenate(
-        [np.column_stack([rim + share * (foot - rim), _BEHIND * min(share, 1.0 - share) * length]) for share in _ALONG]
-    )
-    return np.asarray(places[:: max(1, math.ceil(len(places) / _MOST_PLACES))], dtype=np.float64)
-
-
-def _kept_places(kept: Sequence[Sequence[float]]) -> Float64Array:
-    """Places as a book kept them, none where it is of a time when it kept none; raises ValueError for others.
-
-    Books of a time when only places were kept say nothing of what lies behind.
-    """
-    wide = len(kept[0]) if len(kept) else 4
-    places = np.array(kept, dtype=np.float64).reshape(-1, wide)
-    if wide not in (3, 4) or len(places) > _MOST_PLACES or not np.isfinite(places).all():
-        raise ValueError(f"a region has at most {_MOST_PLACES} places, all of them finite; {len(places)} were kept")
-    return places if wide == 4 else np.column_stack([places, np.zeros(len(places))])
 
 
 def _number(value: float) -> float | None:

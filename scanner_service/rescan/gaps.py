@@ -9,7 +9,7 @@ of the fan in the scanlines of a pass. Between the two ends A and B of such a pa
   laser's shadow runs along the laser's ray;
 - a *flank*: the same, but three pairs or more in a row jump in the same sense, or neither end has a plane, or the plane
   of one leads to the other (of both, where that is more than six radii away): steep surface;
-- *filled*: a shadow of one pass, about whose middle another pass has points;
+- *filled*: a shadow of one pass of which other passes have left nothing;
 - *out of range*: both ends stand near an end of the measurement range;
 - a *hole*: anything else. An inner border of the part, or dropouts: not a reason by itself. So is a jump over places
   without a return to a lone return from which the surface rises again at once: the far wall of a hole; and, without
@@ -22,7 +22,6 @@ from enum import IntEnum, IntFlag
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from drivers.scanline import BoolArray, Float64Array, SensorGeometry, read_only
 from scanner_service.analysis.snapshot import MapSnapshot, RadiusRule, UInt8Array
@@ -44,7 +43,7 @@ class GapKind(IntEnum):
     FLANK = 2
     OUT_OF_RANGE = 3
     HOLE = 4
-    FILLED = 5  # a shadow of this pass whose middle another pass has seen
+    FILLED = 5  # a shadow of this pass of which other passes have left nothing
 
 
 class Mark(IntFlag):
@@ -60,7 +59,9 @@ class Mark(IntFlag):
 class Gaps:
     """The gaps of a map, one row each.
 
-    `high` and `low` (g,) are rows of the snapshot, `high` nearer to the laser. `across` (g,) is True where the gap
+    `high` and `low` (g,) are rows of the snapshot, `high` nearer to the laser; of a shadow that other passes have seen
+    in part they are points of theirs. `line` (g,) is the scanline in which the jump's upper end was
+    found, `group` (g,) its pass. `across` (g,) is True where the gap
     lies across the scanlines (along the travel), False along one line. `width_mm` (g,) is the spacing of such gaps
     beside each other: the ray spacing for gaps across, the line stride for gaps along the line. `lane` (g,) counts
     them beside each other within a pass: the ray for gaps across, the place of the scanline for gaps along the line.
@@ -68,13 +69,15 @@ class Gaps:
 
     high: IntArray
     low: IntArray
+    line: IntArray
+    group: IntArray
     across: BoolArray
     width_mm: Float64Array
     kind: UInt8Array
     lane: IntArray
 
     def __post_init__(self) -> None:
-        for array in (self.high, self.low, self.across, self.width_mm, self.kind, self.lane):
+        for array in (self.high, self.low, self.line, self.group, self.across, self.width_mm, self.kind, self.lane):
             read_only(array)
 
     def __len__(self) -> int:
@@ -150,7 +153,7 @@ def find_pairs(
 ) -> tuple[Pairs, Pairs]:
     """All pairs of neighbours along the lines, and across them, with the kind of those that are gaps.
 
-    None is FILLED: that is for `seen_by_others` to say of the shadows.
+    None is FILLED: what other passes have left of a shadow is for `unseen` to say.
     """
     ends = (_pairs_along(snapshot, strips), _pairs_across(snapshot, stations, frames, strips, fan))
     in_the_air = _in_the_air(snapshot, strips)
@@ -179,9 +182,12 @@ def gaps_between(
     width = (np.nanmin(stations.stride_mm[along], axis=1, initial=np.inf), 2.0 * frames.pitch_rad[group] * away)
     lane = (stations.rank[along], column_of(fan, frames, first[1], group))
     one, other, down = (np.concatenate(parts) for parts in (first, second, is_down))
+    high = np.where(down, one, other)
     return Gaps(
-        high=np.where(down, one, other),
+        high=high,
         low=np.where(down, other, one),
+        line=snapshot.line[high].astype(np.int64),
+        group=stations.group[snapshot.line[high]],
         across=np.repeat([False, True], [len(along), len(across)]),
         width_mm=np.concatenate(width),
         kind=np.concatenate(kind),
@@ -312,26 +318,6 @@ def _far_walls(first: IntArray, second: IntArray, steep: BoolArray, drop: Float6
     far[:-1] |= back & (lost[:-1] > _LOST) & (lost[1:] < lost[:-1])
     far[1:] |= back & (lost[1:] > _LOST) & (lost[:-1] < lost[1:])
     return far
-
-
-def seen_by_others(
-    snapshot: MapSnapshot, stations: Stations, first: IntArray, second: IntArray, others: IntArray
-) -> BoolArray:
-    """True for pairs with a point of another pass nearer to their middle than their own ends are.
-
-    `others` are the points that may be; those further than nine tenths of half a pair from its middle are not looked
-    for.
-    """
-    seen = np.zeros(len(first), dtype=bool)
-    others = others[snapshot.neighbours[others] > 0]
-    of_pair, of_other = stations.group[snapshot.line[first]], stations.group[snapshot.line[others]]
-    for number in np.unique(of_pair):
-        mine, points = np.flatnonzero(of_pair == number), snapshot.points_mm[others[of_other != number]]
-        if len(points):
-            start, end = snapshot.points_mm[first[mine]], snapshot.points_mm[second[mine]]
-            half = 0.5 * np.linalg.norm(end - start, axis=1)
-            seen[mine] = cKDTree(points).query(0.5 * (start + end))[0] < 0.9 * half
-    return seen
 
 
 def near_range_end(snapshot: MapSnapshot, strips: Strips, fan: Fan, geometry: SensorGeometry | None) -> BoolArray:

@@ -21,6 +21,7 @@ from drivers.scanline import BoolArray, Float64Array, SensorGeometry
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.boxes import Boxes, boxes_of
 from scanner_service.rescan.columns import Columns
+from scanner_service.rescan.cuts import AIR
 from scanner_service.rescan.excerpt import excerpt_of, rows_of_lines
 from scanner_service.rescan.frames import Frames, angle_and_depth, frames_of
 from scanner_service.rescan.gaps import (
@@ -31,7 +32,6 @@ from scanner_service.rescan.gaps import (
     find_pairs,
     gaps_between,
     marks_of,
-    seen_by_others,
 )
 from scanner_service.rescan.judgement import Judgement, asked_of_the_first_pass, judge
 from scanner_service.rescan.partners import partners
@@ -39,6 +39,7 @@ from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.rungs import settled_kinds
 from scanner_service.rescan.stations import IntArray, Stations, stations_of
 from scanner_service.rescan.strips import Strips, strips_of
+from scanner_service.rescan.unseen import left_by_others, windows_of
 
 _HOPS = 2  # a point is judged by the lines beside it, and these by those beside them
 _SHIFT = 2  # pairs on either side whose jumps tell the kind of a pair
@@ -204,7 +205,7 @@ class PointVerdicts:
                 f"kind.{side}": pairs.kind[kept],
                 f"first.{side}": rows[pairs.first[kept]].astype(np.int32),
                 f"is_down.{side}": pairs.is_down[kept],
-                f"filled.{side}": np.zeros(len(second), dtype=bool),
+                f"left.{side}": np.zeros((len(second), 2), dtype=np.int32),
             }
             self._columns.put(second, **found)
             renewed.append(second)
@@ -213,40 +214,51 @@ class PointVerdicts:
     def _gaps(
         self, snapshot: MapSnapshot, stations: Stations, frames: Frames, renewed: list[IntArray], changed: IntArray
     ) -> Gaps:
-        """All gaps of the map, each wall of one kind; those that other passes have seen are looked at where need be."""
+        """All gaps of the map, each wall of one kind; of shadows what other passes have left of them."""
         ends: list[tuple[npt.NDArray[Any], ...]] = []
         for side in (0, 1):
             second = np.flatnonzero(self._columns.view(f"kind.{side}", len(snapshot))).astype(np.int64)
-            first, kind, is_down, filled = (
-                self._columns.view(f"{name}.{side}", len(snapshot))[second]
-                for name in ("first", "kind", "is_down", "filled")
-            )
-            if len(frames) > 1:
-                shadow = np.flatnonzero(kind == GapKind.SHADOW)
-                is_new = np.zeros(len(snapshot), dtype=bool)
-                is_new[renewed[side]] = True
-                is_new[changed] = True
-                start, end = snapshot.points_mm[first[shadow]], snapshot.points_mm[second[shadow]]
-                middle, half = 0.5 * (start + end), 0.5 * np.linalg.norm(end - start, axis=1)
-                news = boxes_of(snapshot.points_mm[changed], np.arange(len(changed)), len(changed))
-                around = Boxes(middle, middle).grown(0.9 * half)
-                asked = is_new[second[shadow]] | around.meet(news)
-                rows = shadow[asked]
-                near = np.flatnonzero(self._boxes.meet(around.part(asked)))
-                others = rows_of_lines(snapshot, near)
-                filled[rows] = seen_by_others(snapshot, stations, first[rows], second[rows], others)
-                self._columns.put(second[rows], **{f"filled.{side}": filled[rows]})
-                kind[filled & (kind == GapKind.SHADOW)] = GapKind.FILLED
+            columns = [self._columns.view(f"{name}.{side}", len(snapshot)) for name in ("first", "kind", "is_down")]
+            first, kind, is_down = (column[second] for column in columns)
             ends.append((first, second, kind, is_down))
         firsts, seconds, kinds, downs = zip(*ends, strict=True)
         fan = Fan(**self._columns.views("fan", slice(len(snapshot))))
+        strips = Strips(**self._columns.views("strips", slice(len(snapshot))))
         gaps = gaps_between(snapshot, stations, frames, fan, firsts, seconds, kinds, downs)
-        gaps = settled_kinds(snapshot, Strips(**self._columns.views("strips", slice(len(snapshot)))), gaps)
+        gaps = settled_kinds(snapshot, strips, gaps)
+        if len(frames) > 1:
+            gaps = self._left(snapshot, stations, frames, strips, gaps, seconds, changed)
         if self._requirement.interest is None:
             return gaps
         inside = self._requirement.interest.holds
         beyond = ~(inside(snapshot.points_mm[gaps.high]) | inside(snapshot.points_mm[gaps.low]))
         return replace(gaps, kind=np.where(beyond, np.uint8(GapKind.HOLE), gaps.kind))
+
+    def _left(
+        self, snapshot: MapSnapshot, stations: Stations, frames: Frames, strips: Strips, gaps: Gaps,
+        second: tuple[IntArray, ...], changed: IntArray,
+    ) -> Gaps:  # fmt: skip
+        """The gaps, shadows with the ends of what other passes have left of them; looked at where something is new."""
+        rows = gaps.of_kind(GapKind.SHADOW).astype(np.int64)
+        left = np.concatenate(
+            [self._columns.view(f"left.{side}", len(snapshot))[second[side]] for side in (0, 1)]
+        )  # both 0: not looked at yet
+        left[gaps.kind != GapKind.SHADOW] = 0
+        reach = strips.reach_mm[gaps.high[rows]]
+        windows = windows_of(snapshot, gaps, rows, reach)
+        news = boxes_of(snapshot.points_mm[changed], np.arange(len(changed)), len(changed))
+        asked = ~left[rows].any(axis=1) | windows.meet(news)
+        near = rows_of_lines(snapshot, np.flatnonzero(self._boxes.meet(windows.part(asked))))
+        if not asked.all():
+            near = near[Boxes(snapshot.points_mm[near], snapshot.points_mm[near]).meet(windows.part(asked))]
+        left[rows[asked]] = left_by_others(snapshot, frames, stations, gaps, rows[asked], reach[asked], near)
+        for side, of_side in enumerate(np.split(left, [len(second[0])])):
+            self._columns.put(second[side], **{f"left.{side}": of_side})
+        kind, high, low = gaps.kind.copy(), gaps.high.copy(), gaps.low.copy()
+        filled = left[rows, 0] < 0
+        kind[rows[filled]] = np.where(left[rows[filled], 0] == AIR, GapKind.HOLE, GapKind.FILLED)
+        high[rows[~filled]], low[rows[~filled]] = left[rows[~filled]].T
+        return replace(gaps, kind=kind, high=high, low=low)
 
     def _judge(self, snapshot: MapSnapshot, stations: Stations, frames: Frames, lines_judged: BoolArray) -> IntArray:
         """Judge the points of some lines anew; their rows."""

@@ -26,6 +26,8 @@ _WINDOW = 6  # rungs on either side that tell which way a rim runs
 _SMOOTHED = 3  # quadrangles on either side over which an area vector is smoothed
 _COVERED = 3.0  # rungs within this many lane widths of a ribbon's rim show the same surface
 _SAME_SIDE = 0.05  # cosine between a wall's normal and the way its other rungs go down
+_ALONG = (0.25, 0.5, 0.75)  # of a rung: where it is asked whether it lies on a ribbon
+_BULGE = 0.25  # of a rung's length: so far apart ribbons of two passes over one hidden surface may lie
 _JOINED = 3.0  # ends of chains within this many lane widths belong together
 
 
@@ -127,7 +129,40 @@ def _greedy_cover(rungs: Rungs, chains: list[IntArray]) -> tuple[list[IntArray],
             good &= ~(np.einsum("ij,ij->i", facing[first], rungs.aside[second]) < _SAME_SIDE)
             good &= ~_beyond_an_end(rungs, piece, second)
             stands_for[second[good]] = first[good]
+            others, own = _over_the_same(rungs, piece, np.flatnonzero(stands_for < 0))
+            stands_for[others] = own
     return pieces, stands_for
+
+
+def _over_the_same(rungs: Rungs, piece: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
+    """Rungs of other passes that for the most part lie where a piece does, and the rung of it that each lies on."""
+    others = others[rungs.family[others] // 2 != rungs.family[piece[0]] // 2]
+    if not len(others):
+        return others, others
+    length = rungs.length_mm
+    low = np.minimum(rungs.top_mm[piece], rungs.bottom_mm[piece]).min(axis=0)
+    high = np.maximum(rungs.top_mm[piece], rungs.bottom_mm[piece]).max(axis=0)
+    wide = float(length[piece].max())
+    middle = 0.5 * (rungs.top_mm[others] + rungs.bottom_mm[others])
+    others = others[((middle >= low - wide) & (middle <= high + wide)).all(axis=1)]
+    if not len(others):
+        return others, others
+    count = np.maximum(2, np.ceil(length[piece] / (rungs.width_mm[piece] + rungs.grain_mm[piece]))).astype(np.int64)
+    of_place = np.repeat(piece, count)
+    share = (np.arange(len(of_place)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / np.repeat(count, count)
+    places = rungs.top_mm[of_place] + share[:, None] * (rungs.bottom_mm - rungs.top_mm)[of_place]
+    tree = cKDTree(places)
+    found = np.zeros(len(others), dtype=np.int64)
+    own = np.zeros(len(others), dtype=np.int64)
+    for at in _ALONG:
+        asked = rungs.top_mm[others] + at * (rungs.bottom_mm - rungs.top_mm)[others]
+        away, near = tree.query(asked)
+        rung = of_place[near]
+        within = rungs.width_mm[rung] + rungs.grain_mm[rung] + _BULGE * np.fmin(length[rung], length[others])
+        found += away <= within
+        own = np.where(away <= within, rung, own)
+    most = 2 * found > len(_ALONG)
+    return others[most], own[most]
 
 
 def _beyond_an_end(rungs: Rungs, piece: IntArray, others: IntArray) -> BoolArray:

@@ -69,7 +69,7 @@ def rungs_of(snapshot: MapSnapshot, strips: Strips, gaps: Gaps, rows: IntArray) 
     if not len(rows):
         nowhere = np.zeros((0, 3))
         return Rungs(rows, rows, nowhere, nowhere, rows, rows, np.zeros(0), np.zeros(0), nowhere, nowhere, rows, rows)
-    family = 2 * strips.group[high] + gaps.across[rows]
+    family = 2 * gaps.group[rows] + gaps.across[rows]
     # a gap whose upper end is the lower end of another in the same lane hangs below it
     lanes = gaps.lane[rows] - gaps.lane[rows].min()
     lane = np.unique(family * (int(lanes.max()) + 1) + lanes, return_inverse=True)[1].reshape(-1).astype(np.int64)
@@ -82,7 +82,7 @@ def rungs_of(snapshot: MapSnapshot, strips: Strips, gaps: Gaps, rows: IntArray) 
     of_gap = np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
     count = int(of_gap.max(initial=-1)) + 1
     above, below = (
-        np.linalg.norm(snapshot.points_mm[ends] - snapshot.lines.laser_mm[snapshot.line[ends]], axis=1)
+        np.linalg.norm(snapshot.points_mm[ends] - snapshot.lines.laser_mm[gaps.line[rows]], axis=1)
         for ends in (high, low)
     )
     nearest_first = np.argsort(above, kind="stable")
@@ -93,7 +93,7 @@ def rungs_of(snapshot: MapSnapshot, strips: Strips, gaps: Gaps, rows: IntArray) 
     top, bottom = high[top_gap], low[bottom_gap]
     across = gaps.across[rows][top_gap]
     width = gaps.width_mm[rows][top_gap]
-    ray = snapshot.points_mm[top] - snapshot.lines.laser_mm[snapshot.line[top]]
+    ray = snapshot.points_mm[top] - snapshot.lines.laser_mm[gaps.line[rows][top_gap]]
     ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
     aside = snapshot.points_mm[bottom] - snapshot.points_mm[top]
     aside -= ray * np.einsum("ij,ij->i", aside, ray)[:, None]

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from drivers.errors import DriverError
-from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.errors import PlanningError
 from scanner_service.rescan.passes.recommendation import Plan
 from scanner_service.rescan.passes.serving import EVERYTHING, Serving
@@ -21,6 +20,8 @@ from scanner_service.sessions.pass_planning import name_of
 from scanner_service.sessions.results import Results
 
 _LOG = logging.getLogger(__name__)
+_MOST_OVERTAKEN = 8
+_ALWAYS_OVERTAKEN = "the verdict kept changing while passes were planned; let the scan come to rest and begin anew"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +44,7 @@ class LoopState:
     limits: LoopLimits
     passes: int = 0
     seconds: float = 0.0
+    overtaken: int = 0  # plans in a row that another verdict came before
     running: bool = True
     why_ended: str | None = None
     wanted_end: threading.Event = field(default_factory=threading.Event)
@@ -114,7 +116,9 @@ def _step(desk: LoopDesk, loop: LoopState) -> str | None:
     try:
         order = desk.accept(best.number, limits.serving, name_of(plan))
     except PlanOvertaken:
-        return None  # it is planned anew
+        loop.overtaken += 1
+        return None if loop.overtaken < _MOST_OVERTAKEN else _ALWAYS_OVERTAKEN
+    loop.overtaken = 0
     try:
         desk.carry_out(order.order_id)
     except (SessionError, DriverError, PlanningError) as error:
@@ -131,23 +135,9 @@ def _fulfilled(results: Results, limits: LoopLimits) -> str | None:
     share = limits.coverage_share if limits.coverage_share is not None else results.requirement.coverage_share
     if share is not None:
         kind = "observed coverage" if results.reference is None else "coverage of the nominal part"
-        return f"the {kind} of {share:.1%} is reached" if _share_with_listed_shadows(results) >= share else None
+        return f"the {kind} of {share:.1%} is reached" if results.share >= share else None
     wanted = [region for region in results.regions if limits.serving.wants(region)]
     return None if wanted else "the requirement holds: no region is left"
-
-
-def _share_with_listed_shadows(results: Results) -> float:
-    """Coverage, in which a shadow counts as long as it is listed.
-
-    The observed coverage takes a gap for filled when another pass has points about its middle, though half of what it
-    hides may be missing; the list of regions asks for more.
-    """
-    if results.reference is not None:
-        return results.share
-    listed_mm2 = sum(region.area_mm2 for region in results.regions if region.reason is Reason.SHADOW)
-    seen_mm2 = float(results.coverage.area_mm2.sum()) + results.coverage.gap_mm2
-    more_mm2 = max(0.0, listed_mm2 - results.coverage.gap_mm2)
-    return results.share * seen_mm2 / (seen_mm2 + more_mm2) if seen_mm2 else results.share
 
 
 def _nothing_left(results: Results, plan: Plan) -> str:

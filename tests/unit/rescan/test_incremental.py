@@ -46,6 +46,7 @@ def passes(draw: st.DrawFn) -> list[StoredLine]:
     is_long = draw(st.booleans())  # long enough for lines that nothing touches any more
     for number in range(draw(st.integers(1, 1 if is_long else 3))):
         turned, backward = draw(st.booleans()), draw(st.booleans())
+        lean_mm = draw(st.sampled_from([0.0, -70.0, 70.0]))  # what one pass hides another may see
         spacing = draw(st.sampled_from([0.3, 0.45]))
         stations = np.arange(0.5, 7.5, spacing) if not is_long else 0.5 + spacing * np.arange(96)
         if draw(st.booleans()):
@@ -58,12 +59,19 @@ def passes(draw: st.DrawFn) -> list[StoredLine]:
         if draw(st.booleans()):
             late = order.pop(3)
             order.insert(8, late)
-        lines += [_line(surface, number, at, stations[at], spacing, turned, rng) for at in order]
+        lines += [_line(surface, number, at, stations[at], spacing, turned, rng, lean_mm) for at in order]
     return lines
 
 
 def _line(
-    surface: Height, number: int, at: int, station: float, spacing: float, turned: bool, rng: np.random.Generator
+    surface: Height,
+    number: int,
+    at: int,
+    station: float,
+    spacing: float,
+    turned: bool,
+    rng: np.random.Generator,
+    lean_mm: float = 0.0,
 ) -> StoredLine:
     along = np.arange(-4.0, 4.0, 0.25)
     across = np.full_like(along, station)
@@ -79,7 +87,7 @@ def _line(
         device_time_s=0.0,
         points_mm=np.column_stack([x, y, z]),
         missing=~seen,
-        laser_mm=np.array([station - 4.0, 4.0, 100.0]) if turned else np.array([0.0, station, 100.0]),
+        laser_mm=np.array([station - 4.0, 4.0 + lean_mm, 100.0] if turned else [lean_mm, station, 100.0]),
         plane_normal=travel,
         travel=travel,
         position_mm=station,
