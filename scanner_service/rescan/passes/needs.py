@@ -14,6 +14,7 @@ from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.gaps import GapKind
 from scanner_service.rescan.judgement import Reason
+from scanner_service.rescan.passes.hidden_by import hidden_by
 from scanner_service.rescan.passes.known_surface import IntArray, KnownSurface
 from scanner_service.rescan.passes.marching import FREE
 from scanner_service.rescan.passes.nominal import Missing
@@ -181,6 +182,8 @@ def find_needs(
     elif explore:
         parts += [_frontier(surface), _backs(surface)]
     places, normals, area, region, evidence, sure = (np.concatenate(column) for column in zip(*parts, strict=True))
+    loose = np.flatnonzero(np.isin(evidence, HIDDEN_KINDS))
+    region[loose] = hidden_by(regions, places[loose], surface.cell_mm)
     keep = _apart(surface, places, normals, evidence)
     found = tuple(column[keep] for column in (places, normals, area, region, evidence, sure))
     bare = _bare(regions, set(found[3].tolist()))
@@ -247,7 +250,7 @@ def _floors(
 
 
 def _frontier(surface: KnownSurface) -> Columns:
-    """Where hidden space begins; it belongs to no region.
+    """Where hidden space begins.
 
     Rests are rarely surface where they are thin, at their edges, and away from known surface.
     """

@@ -87,8 +87,7 @@ def plan_passes(
     surface = know_surface(snapshot, fails, region, wishes.cell_mm, looks, optics, pieces)
     missing = None if reference is None else missing_of(reference, regions)
     wanted = Wanted.of(wishes.density_per_mm2, wishes.requirement)
-    explore = wishes.explore and wishes.serving.is_everything
-    needs = find_needs(snapshot, report, surface, wanted, wishes.learned.chances, explore, regions, missing)
+    needs = find_needs(snapshot, report, surface, wanted, wishes.learned.chances, wishes.explore, regions, missing)
     if not wishes.serving.is_everything:
         named = [one.number for one in regions if wishes.serving.wants(one)]
         needs = needs.only(np.isin(needs.region, named))
