@@ -11,15 +11,17 @@ from typing import Protocol
 
 from drivers.errors import DriverError
 from scanner_service.rescan.passes.errors import PlanningError
-from scanner_service.rescan.passes.recommendation import Plan
+from scanner_service.rescan.passes.recommendation import Plan, RecommendedPass
 from scanner_service.rescan.passes.serving import EVERYTHING, Serving
-from scanner_service.rescan.region import RegionStatus
+from scanner_service.rescan.region import RegionStatus, RescanRegion
 from scanner_service.sessions.errors import PlanOvertaken, SessionError
 from scanner_service.sessions.pass_orders import PassOrder, PassStatus
 from scanner_service.sessions.pass_planning import name_of
 from scanner_service.sessions.results import Results
 
 _LOG = logging.getLogger(__name__)
+_HIDDEN = 0.01  # of the surface seen: passes that expect less where no region is left are not worth their time
+_HOLDS = "the requirement holds: no region is left"
 _MOST_OVERTAKEN = 8
 _ALWAYS_OVERTAKEN = "the verdict kept changing while passes were planned; let the scan come to rest and begin anew"
 
@@ -105,6 +107,8 @@ def _step(desk: LoopDesk, loop: LoopState) -> str | None:
         return done
     plan = desk.plan(limits.serving)
     drivable = [one for one in plan.passes if one.turn is None or one.turn.is_none]
+    if not _wanted(results, limits) and _may_be_hidden_mm2(drivable) < _HIDDEN * float(results.coverage.area_mm2.sum()):
+        return _HOLDS
     if not drivable:
         return _nothing_left(desk.judged(), plan)
     best = drivable[0]
@@ -136,8 +140,18 @@ def _fulfilled(results: Results, limits: LoopLimits) -> str | None:
     if share is not None:
         kind = "observed coverage" if results.reference is None else "coverage of the nominal part"
         return f"the {kind} of {share:.1%} is reached" if results.share >= share else None
-    wanted = [region for region in results.regions if limits.serving.wants(region)]
-    return None if wanted else "the requirement holds: no region is left"
+    if limits.serving.is_everything or _wanted(results, limits):
+        return None  # what nobody saw may be in no region: a plan tells
+    return _HOLDS
+
+
+def _wanted(results: Results, limits: LoopLimits) -> list[RescanRegion]:
+    return [region for region in results.regions if limits.serving.wants(region)]
+
+
+def _may_be_hidden_mm2(passes: list[RecommendedPass]) -> float:
+    """What passes expect to find, where there is no region that they could serve."""
+    return sum(one.gain_mm2 for one in passes)
 
 
 def _nothing_left(results: Results, plan: Plan) -> str:

@@ -63,7 +63,7 @@ def _played_again(path, kept):
 
 @pytest.fixture
 def scanned(tmp_path):
-    """A record of two passes after the first of which a shadow was listed that the last report does not have."""
+    """A record of two passes, after the first of which a shadow was listed that the last report does not have."""
     path = tmp_path / "record.sqlite"
     with Record.open(path) as record:
         book = SessionBook(record)
@@ -106,9 +106,10 @@ def _list_a_wall_that_no_later_report_has(session):
 
 def test_the_same_regions_are_listed_live_stored_reopened_and_replayed(scanned, tmp_path):
     path, session_id, live = scanned
-    extra = [region for region in live.regions if region.reason is Reason.SHADOW and region.area_mm2 == 18.0]
-    assert [region.status for region in extra] == [RegionStatus.RESCANNED]
-    assert len(live.regions) > len(live.report.regions)  # the list is not that of the last report alone
+    extra = [region for region in live.resolved if region.reason is Reason.SHADOW and region.area_mm2 == 18.0]
+    assert [region.status for region in extra] == [
+        RegionStatus.RESOLVED
+    ]  # of which the last report alone knows nothing
     stored, again = _stored(path), _played_again(path, tmp_path / "again.sqlite")
     assert verdict_sha256(stored) == verdict_sha256(again) == verdict_sha256(live)
     assert _told(stored) == _told(live)

@@ -85,7 +85,7 @@ def test_a_turntable_is_looped_until_its_part_is_scanned_all_around(tmp_path):
                     assert 0.0 <= one.start_mm <= FULL_TURN_MM and 0.0 <= one.end_mm <= FULL_TURN_MM
                     scan(one.motion, one.start_mm, one.end_mm, one.line_spacing_mm)
             desk._session._closing.wait(0.02)
-        assert loop.why_ended == "the limit of 2 passes is met"
+        assert loop.why_ended == "the limit of 2 passes is met"  # what no gap betrays is looked for, too
         assert before < 0.7
         assert share_of_sides_dense_enough(np.concatenate(scanned)) > 0.97
         for order in desk.orders():
