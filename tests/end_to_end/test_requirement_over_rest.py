@@ -1,6 +1,7 @@
 """What a user asks for goes in over REST, is judged by, and comes out again; what cannot be meant is refused."""
 
 import struct
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -131,7 +132,12 @@ def test_what_is_asked_for_may_change_after_the_scan_and_everything_is_judged_an
     assert client.get(f"{scanned}/regions").json()["regions"] == []
     status = client.get(scanned).json()
     assert (status["requirement"], status["holds"]) == (loose["requirement"], True)
-    kinds = [event["kind"] for event in client.get(f"{scanned}/events").json()["events"]]
+    deadline = time.monotonic() + 120.0
+    while True:  # events are written behind the answer
+        kinds = [event["kind"] for event in client.get(f"{scanned}/events").json()["events"]]
+        if kinds[-1] == "regions_followed" or time.monotonic() > deadline:
+            break
+        time.sleep(0.05)
     assert kinds.count("requirement_changed") == 3
     assert kinds[-1] == "regions_followed", "what a later opening goes on with is of the new verdict"
 
