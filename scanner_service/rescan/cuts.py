@@ -11,7 +11,6 @@ from numba import njit
 
 NOTHING, AIR = -1, -2
 DETOUR = 1.8  # a way over hidden surface is at most so much longer than the straight one
-CELL_MM = 1.0  # side of the cells that points are found by
 _TOUCHING = 2.0  # radii: so far apart the neighbourhoods of two points touch
 _SHARE = 0.6  # ... but no step is longer than this share of the gap itself
 _THIN = 0.35  # steps: of points closer than that one will do
@@ -24,7 +23,7 @@ _MOST = 512  # points of a cut; with more they are thinned again
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_widest_steps(
-    places, rows, groups, borders, keys, lowest, shape, starts, ends, ways, normals, own, reaches, found
+    columns, rows, groups, borders, starts, ends, ways, normals, own, reaches, found
 ):  # fmt: skip
     """Write into `found` (k, 2) the rows between which the chain from each start to its end has its widest step."""
     taken = np.full((_SIDE, _SIDE), -1, dtype=np.int64)
@@ -36,8 +35,8 @@ def find_widest_steps(
         across = np.cross(normals[k], ways[k])
         while True:
             count, others = _cut(
-                places, rows, groups, borders, keys, lowest, shape, starts[k], length, ways[k], across, normals[k],
-                own[k], reaches[k], fine, taken, u, v, row,
+                columns, rows, groups, borders, starts[k], length, ways[k], across, normals[k], own[k], reaches[k],
+                fine, taken, u, v, row,
             )  # fmt: skip
             if count <= _MOST:
                 break
@@ -55,24 +54,21 @@ def find_widest_steps(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cut(
-    places, rows, groups, borders, keys, lowest, shape, start, length, way, across, normal, own, reach, fine, taken, u,
-    v, row,
+    columns, rows, groups, borders, start, length, way, across, normal, own, reach, fine, taken, u, v, row
 ):  # fmt: skip
     """The points near the plane of a gap, one a cell of side `fine`: how many, and whether other passes have any."""
+    places, begin, lowest, side, wide, long = columns
     count, others = 0, False
     half, rest = 0.5 * DETOUR * length, 0.5 * math.sqrt(DETOUR * DETOUR - 1.0) * length
-    first, last = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
-    for axis in range(3):
+    first, last = np.empty(2, dtype=np.int64), np.empty(2, dtype=np.int64)
+    for axis in range(2):
         extent = math.sqrt((half * way[axis]) ** 2 + (rest * across[axis]) ** 2) + reach * abs(normal[axis])
         middle = start[axis] + 0.5 * length * way[axis] - lowest[axis]
-        first[axis] = max(0, math.floor((middle - extent) / CELL_MM))
-        last[axis] = min(shape[axis] - 1, math.floor((middle + extent) / CELL_MM))
-    for i in range(first[0], last[0] + 1):
-        for j in range(first[1], last[1] + 1):
-            if last[2] < first[2]:
-                continue
-            key = (i * shape[1] + j) * shape[2]
-            for n in range(np.searchsorted(keys, key + first[2]), np.searchsorted(keys, key + last[2] + 1)):
+        first[axis] = max(0, math.floor((middle - extent) / side))
+        last[axis] = math.floor((middle + extent) / side)
+    for i in range(first[0], min(last[0], wide - 1) + 1):
+        for j in range(first[1], min(last[1], long - 1) + 1):
+            for n in range(begin[i * long + j], begin[i * long + j + 1]):
                 x, y, z = places[n, 0] - start[0], places[n, 1] - start[1], places[n, 2] - start[2]
                 if abs(x * normal[0] + y * normal[1] + z * normal[2]) > reach:
                     continue
@@ -89,10 +85,8 @@ def _cut(
                     count += 1
                     continue
                 at = taken[p, q]
-                better = borders[rows[n]] and not borders[row[at]]
-                if better or (
-                    borders[rows[n]] == borders[row[at]] and rows[n] < row[at]
-                ):  # in whatever order they come
+                is_border, was_border = borders[rows[n]], borders[row[at]]
+                if is_border > was_border or (is_border == was_border and rows[n] < row[at]):  # in whatever order
                     u[at], v[at], row[at] = a, b, rows[n]
     for n in range(count):
         taken[int((u[n] - 0.5 * length + half) / fine), int((v[n] + half) / fine)] = -1
@@ -132,8 +126,9 @@ def _widest_step(u, v, last):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_crossed(places, lasers, keys, lowest, shape, firsts, lasts, normals, reaches, middles, halves, crossed):
+def find_crossed(columns, lasers, firsts, lasts, normals, reaches, middles, halves, crossed):
     """Note (k,) which steps the rays to some returns go through, in the middle; returns in the window are looked at."""
+    places, begin, lowest, side, wide, long = columns
     count, low, high = np.zeros(3, dtype=np.int64), np.empty(3), np.empty(3)
     for k in range(len(firsts)):
         if crossed[k]:
@@ -147,15 +142,14 @@ def find_crossed(places, lasers, keys, lowest, shape, firsts, lasts, normals, re
             middle = 0.5 * (firsts[k, axis] + lasts[k, axis])
             low[axis] = max(middle - near, middles[k, axis] - halves[k])
             high[axis] = min(middle + near, middles[k, axis] + halves[k])
-        i0, j0, l0 = np.maximum(0.0, np.floor((low - lowest) / CELL_MM)).astype(np.int64)
-        i1, j1, l1 = np.minimum(shape - 1.0, np.floor((high - lowest) / CELL_MM)).astype(np.int64)
+        i0, j0 = max(0, math.floor((low[0] - lowest[0]) / side)), max(0, math.floor((low[1] - lowest[1]) / side))
+        i1, j1 = math.floor((high[0] - lowest[0]) / side), math.floor((high[1] - lowest[1]) / side)
         count[:] = 0
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                if l1 < l0 or count.min() >= _RAYS:
+        for i in range(i0, min(i1, wide - 1) + 1):
+            for j in range(j0, min(j1, long - 1) + 1):
+                if count.min() >= _RAYS:
                     continue
-                key = (i * shape[1] + j) * shape[2]
-                for n in range(np.searchsorted(keys, key + l0), np.searchsorted(keys, key + l1 + 1)):
+                for n in range(begin[i * long + j], begin[i * long + j + 1]):
                     x, y, z = places[n, 0], places[n, 1], places[n, 2]
                     if x < low[0] or y < low[1] or z < low[2] or x > high[0] or y > high[1] or z > high[2]:
                         continue

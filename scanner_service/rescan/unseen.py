@@ -15,14 +15,19 @@ import numpy as np
 from drivers.scanline import BoolArray, Float64Array
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.boxes import Boxes
-from scanner_service.rescan.cuts import AIR, CELL_MM, DETOUR, find_crossed, find_widest_steps
+from scanner_service.rescan.cuts import AIR, DETOUR, find_crossed, find_widest_steps
 from scanner_service.rescan.frames import Frames
 from scanner_service.rescan.gaps import Gaps
 from scanner_service.rescan.stations import IntArray, Stations
 
 _FACING = 0.7  # cosine: the walls of a hole face each other, and a straight way between them is air
 _BORDER = 0.25  # centroid offset, radii: 0.42 where surface ends straight; below, it goes on all around
+_COLUMN_MM = 1.0  # side of the columns that points are found by, or ...
+_MOST_COLUMNS = 2000  # ... so wide that there are at most so many side by side
 _EVERY = 4  # one return of so many in every other line is asked for its ray
+
+_Columns = tuple[Float64Array, IntArray, Float64Array, float, int, int]
+"""Points (n, 3) column by column, where each begins (c + 1,), the lowest corner (2,), their side, how many in x and y."""
 
 
 def windows_of(snapshot: MapSnapshot, gaps: Gaps, rows: IntArray, reach_mm: Float64Array) -> Boxes:
@@ -58,22 +63,19 @@ def left_by_others(
     way = _unit(end - start)
     aside = np.where(gaps.across[rows, None], frames.along[group], np.cross(frames.along[group], frames.axis[group]))
     normal = _unit(aside - way * np.einsum("ij,ij->i", aside, way)[:, None])
-    kept, places, keys, lowest, shape = _by_cell(snapshot, points)
+    kept, columns = _in_columns(snapshot, points)
     is_border = ~(snapshot.offset < _BORDER)
     find_widest_steps(
-        places, kept, stations.group[snapshot.line[kept]], is_border, keys, lowest, shape, start, end, way, normal,
-        group, reach_mm, ends,
+        columns, kept, stations.group[snapshot.line[kept]], is_border, start, end, way, normal, group, reach_mm, ends
     )  # fmt: skip
     found = np.flatnonzero(ends[:, 0] >= 0)
     first, last = snapshot.points_mm[ends[found, 0]], snapshot.points_mm[ends[found, 1]]
     air = _face_each_other(snapshot, ends[found])
     some = (snapshot.index[points] % _EVERY == 0) & (snapshot.lines.line_index[snapshot.line[points]] % 2 == 0)
-    kept, places, keys, lowest, shape = _by_cell(snapshot, points[some])
+    kept, columns = _in_columns(snapshot, points[some])
     lasers = snapshot.lines.laser_mm[snapshot.line[kept]]
     middle, half = 0.5 * (start + end)[found], 0.5 * DETOUR * np.linalg.norm(end - start, axis=1)[found]
-    find_crossed(
-        places, lasers, keys, lowest, shape, first, last, normal[found], reach_mm[found], middle, half, air
-    )  # fmt: skip
+    find_crossed(columns, lasers, first, last, normal[found], reach_mm[found], middle, half, air)
     ends[found[air]] = AIR
     found, first, last = found[~air], first[~air], last[~air]
     laser = snapshot.lines.laser_mm[gaps.line[rows[found]]]
@@ -82,17 +84,17 @@ def left_by_others(
     return ends
 
 
-def _by_cell(
-    snapshot: MapSnapshot, points: IntArray
-) -> tuple[IntArray, Float64Array, IntArray, Float64Array, IntArray]:
-    """Some points by the cells they lie in: rows, places and keys of the cells; lowest corner and shape of all."""
+def _in_columns(snapshot: MapSnapshot, points: IntArray) -> tuple[IntArray, _Columns]:
+    """Some points in the order of the columns they lie in, and these."""
     places = snapshot.points_mm[points]
-    lowest = places.min(axis=0, initial=0.0) if len(places) else np.zeros(3)
-    cell = np.floor((places - lowest) / CELL_MM).astype(np.int64)
-    shape = cell.max(axis=0, initial=0) + 1
-    key = (cell[:, 0] * shape[1] + cell[:, 1]) * shape[2] + cell[:, 2]
-    order = np.argsort(key, kind="stable")
-    return points[order], places[order], key[order], lowest, shape
+    low = places.min(axis=0)[:2] if len(points) else np.zeros(2)
+    side = max(_COLUMN_MM, float((places[:, :2] - low).max(initial=0.0)) / _MOST_COLUMNS)
+    at = np.floor((places[:, :2] - low) / side).astype(np.int64)
+    wide, long = (int(one) + 1 for one in at.max(axis=0, initial=0))
+    column = at[:, 0] * long + at[:, 1]
+    order = np.argsort(column, kind="stable")
+    start = np.searchsorted(column[order], np.arange(wide * long + 1))
+    return points[order], (places[order], start, low, side, wide, long)
 
 
 def _face_each_other(snapshot: MapSnapshot, ends: IntArray) -> BoolArray:

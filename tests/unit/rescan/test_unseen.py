@@ -8,9 +8,11 @@ from scipy.spatial import cKDTree
 
 from drivers.scanline import Pose
 from scanner_service.rescan.coverage import observed_coverage
+from scanner_service.rescan.cuts import NOTHING
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.requirement import Interest, Requirement
+from scanner_service.rescan.unseen import left_by_others, windows_of
 from simulators.shapes import Cylinder, Difference, Union, box
 from tests.unit.rescan.passes.posed_scans import FROM_ABOVE, Bench
 
@@ -73,6 +75,31 @@ def stages(part: str) -> list[tuple[float, float, float]]:
         seen = snapshot.points_mm[snapshot.neighbours > 0]
         told.append((true_share(part, seen), observed_coverage(snapshot, report).share, shadows))
     return told
+
+
+def test_what_is_left_hangs_on_no_order_and_on_no_other_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that a gap may be looked at again alone, among more or fewer points than before."""
+    rng, asked = np.random.default_rng(2), []
+
+    def kept(*arguments):
+        asked.append((arguments, left_by_others(*arguments)))
+        return asked[-1][1].copy()
+
+    monkeypatch.setattr("scanner_service.rescan.points.left_by_others", kept)
+    bench = Bench(PARTS["pocket"]).scan(FROM_ABOVE, 0.0, 24.0, 0.3).scan(leaning(90.0), -14.0, 38.0, 0.3)
+    bench.judged(ASKED)
+    (((snapshot, frames, stations, gaps, rows, reach, points), left),) = asked
+    assert {NOTHING} < set(left[:, 0].tolist()) and (left[:, 0] >= 0).any()
+    some = rng.permutation(len(rows))[: len(rows) // 3]
+    windows = windows_of(snapshot, gaps, rows[some], reach[some])
+    near = [
+        ((places >= windows.low_mm) & (places <= windows.high_mm)).all(axis=1).any()
+        for places in snapshot.points_mm[points]
+    ]
+    fewer = rng.permutation(points[np.array(near)])
+    assert 0 < len(fewer) < len(points)
+    again = left_by_others(snapshot, frames, stations, gaps, rows[some], reach[some], fewer)
+    np.testing.assert_array_equal(again, left[some])
 
 
 @pytest.mark.parametrize("part", sorted(PARTS))
