@@ -27,7 +27,7 @@ _MOST_COLUMNS = 2000  # ... so wide that there are at most so many side by side
 _EVERY = 4  # one return of so many in every other line is asked for its ray
 
 _Columns = tuple[Float64Array, IntArray, Float64Array, float, int, int]
-"""Points (n, 3) column by column, where each begins (c + 1,), the lowest corner (2,), their side, how many in x and y."""
+"""Points (n, 3) column by column, where each begins (c + 1,), lowest corner (2,), side, how many in x and in y."""
 
 
 def windows_of(snapshot: MapSnapshot, gaps: Gaps, rows: IntArray, reach_mm: Float64Array) -> Boxes:
