@@ -22,9 +22,9 @@ def hidden_by(regions: Sequence[RescanRegion], places_mm: Float64Array, cell_mm:
     if not len(number) or not len(places_mm):
         return np.zeros(len(places_mm), dtype=np.int64)
     places = np.concatenate([places for _, places in ribbons])
-    away, nearest = cKDTree(places[:, :3]).query(places_mm)
-    within = np.maximum(_BESIDE * cell_mm, _BULGE * places[nearest, 3])
-    return np.where(away <= within, number[nearest], 0).astype(np.int64)
+    within = np.append(np.maximum(_BESIDE * cell_mm, _BULGE * places[:, 3]), 0.0)
+    away, nearest = cKDTree(places[:, :3]).query(places_mm, distance_upper_bound=float(within.max()))
+    return np.where(away <= within[nearest], np.append(number, 0)[nearest], 0)
 
 
 def _places_on(region: RescanRegion) -> Float64Array:
