@@ -21,6 +21,7 @@ from scanner_service.rescan.stations import IntArray
 
 _CUBE_MM = 1.5
 _OVER = 0.1  # share of a region's cubes that a later pass must touch before the region counts as rescanned
+_SHOWN = "no verdict finds it any more: what it hid is seen, or there is nothing"
 _MOST_MOMENTS = 64
 _KEPT_CUBES = 40
 _MOST_RESOLVED = 1000
@@ -94,7 +95,8 @@ class RegionBook:
                 kept[known_id] = old  # it waits for points to settle
                 continue
             merged = [other for other, cubes in zip(ids, fresh, strict=True) if other and len(cubes & old.cubes)]
-            why = f"is part of region {merged[0]} now" if merged else "its surface meets the requirement"
+            why = "its surface meets the requirement" if old.region.reason is not Reason.SHADOW else _SHOWN
+            why = f"is part of region {merged[0]} now" if merged else why
             self._resolved[known_id] = _stepped(known_id, old, RegionStatus.RESOLVED, why, self._version, changes)
         while len(self._resolved) > _MOST_RESOLVED:
             del self._resolved[min(self._resolved)]

@@ -21,7 +21,6 @@ from drivers.scanline import BoolArray, Float64Array, SensorGeometry
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.boxes import Boxes, boxes_of
 from scanner_service.rescan.columns import Columns
-from scanner_service.rescan.cuts import AIR
 from scanner_service.rescan.excerpt import excerpt_of, rows_of_lines
 from scanner_service.rescan.frames import Frames, angle_and_depth, frames_of
 from scanner_service.rescan.gaps import (
@@ -39,7 +38,7 @@ from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.rungs import settled_kinds
 from scanner_service.rescan.stations import IntArray, Stations, stations_of
 from scanner_service.rescan.strips import Strips, strips_of
-from scanner_service.rescan.unseen import left_by_others, windows_of
+from scanner_service.rescan.unseen import AIR, left_by_others, windows_of
 
 _HOPS = 2  # a point is judged by the lines beside it, and these by those beside them
 _SHIFT = 2  # pairs on either side whose jumps tell the kind of a pair
@@ -97,8 +96,8 @@ class PointVerdicts:
         touched = self._touched(snapshot, stations, frames, changed)
         self._stations, self._frames, self._count = stations, frames, len(snapshot)
         core = _with_adjacent(stations, touched, _HOPS)
-        renewed = self._measure(snapshot, stations, frames, core)
-        gaps = self._gaps(snapshot, stations, frames, renewed, changed)
+        self._measure(snapshot, stations, frames, core)
+        gaps = self._gaps(snapshot, stations, frames, changed)
         marks = marks_of(len(snapshot), gaps)
         other = np.zeros(len(core), dtype=bool)
         other[snapshot.line[marks != self._columns.view("marks", len(snapshot))]] = True
@@ -176,8 +175,8 @@ class PointVerdicts:
         for at, first, last in zip(lines.tolist(), *(side.tolist() for side in border), strict=True):
             self._rays[at] = np.unique(column[first:last])
 
-    def _measure(self, snapshot: MapSnapshot, stations: Stations, frames: Frames, core: BoolArray) -> list[IntArray]:
-        """Measure strips and pairs of the core lines anew; the second points of the pairs along and across renewed."""
+    def _measure(self, snapshot: MapSnapshot, stations: Stations, frames: Frames, core: BoolArray) -> None:
+        """Measure strips and pairs of the core lines anew."""
         far = partners(stations, self._rays, core, 2 * _SHIFT + 1)
         lines = np.flatnonzero(_with_adjacent(stations, core | far, 1))
         rows = rows_of_lines(snapshot, lines)
@@ -190,7 +189,6 @@ class PointVerdicts:
         values |= {f"strips.{name}": home[values[f"strips.{name}"]].astype(np.int32) for name in _ROWS}
         self._columns.put(rows[own], **values)
         del values
-        renewed = []
         for side, pairs in enumerate(find_pairs(excerpt, own_stations, frames, strips, fan, self._geometry)):
             kept = is_core[pairs.first] | is_core[pairs.second]
             goes_on = pairs.first[1:] == pairs.second[:-1]
@@ -208,12 +206,8 @@ class PointVerdicts:
                 f"left.{side}": np.zeros((len(second), 2), dtype=np.int32),
             }
             self._columns.put(second, **found)
-            renewed.append(second)
-        return renewed
 
-    def _gaps(
-        self, snapshot: MapSnapshot, stations: Stations, frames: Frames, renewed: list[IntArray], changed: IntArray
-    ) -> Gaps:
+    def _gaps(self, snapshot: MapSnapshot, stations: Stations, frames: Frames, changed: IntArray) -> Gaps:
         """All gaps of the map, each wall of one kind; of shadows what other passes have left of them."""
         ends: list[tuple[npt.NDArray[Any], ...]] = []
         for side in (0, 1):
@@ -243,14 +237,12 @@ class PointVerdicts:
         left = np.concatenate(
             [self._columns.view(f"left.{side}", len(snapshot))[second[side]] for side in (0, 1)]
         )  # both 0: not looked at yet
-        left[gaps.kind != GapKind.SHADOW] = 0
+        left[gaps.kind != GapKind.SHADOW] = 0  # and what is no shadow now is looked at when it is one again
         reach = strips.reach_mm[gaps.high[rows]]
         windows = windows_of(snapshot, gaps, rows, reach)
         news = boxes_of(snapshot.points_mm[changed], np.arange(len(changed)), len(changed))
         asked = ~left[rows].any(axis=1) | windows.meet(news)
         near = rows_of_lines(snapshot, np.flatnonzero(self._boxes.meet(windows.part(asked))))
-        if not asked.all():
-            near = near[Boxes(snapshot.points_mm[near], snapshot.points_mm[near]).meet(windows.part(asked))]
         left[rows[asked]] = left_by_others(snapshot, frames, stations, gaps, rows[asked], reach[asked], near)
         for side, of_side in enumerate(np.split(left, [len(second[0])])):
             self._columns.put(second[side], **{f"left.{side}": of_side})

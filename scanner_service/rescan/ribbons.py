@@ -278,7 +278,7 @@ def _ribbon(rungs: Rungs, strand: IntArray, closed: bool, gaps: IntArray) -> Rib
     elif len(strand) == 1:
         aside = np.cross(rungs.ray[strand], bottom - top)
         aside *= 0.5 * rungs.width_mm[strand[0]] / max(float(np.linalg.norm(aside)), 1e-12)
-        loops = (np.concatenate([top - aside, bottom - aside, bottom + aside, top + aside]),)
+        loops = (np.concatenate([top - aside, top + aside, bottom + aside, bottom - aside]),)
     else:
         loops = (np.concatenate([top, bottom[::-1]]),)
     middle = (areas[:, None] * middles).sum(axis=0) / total if total > 0 else middles.mean(axis=0)

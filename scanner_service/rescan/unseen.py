@@ -5,9 +5,9 @@ that plane from one end to the other, wherever it goes in between. So the points
 chain from end to end once the surface is seen, whatever the wall and the floor behind the rim look like; until then
 the chain breaks, and its widest step is what is left. Two points belong together when their neighbourhoods touch.
 
-A cut may also meet two bodies, or the two walls of a hole, with nothing between but air. The step from one to the
-other is no surface when what was measured goes on all around both of its ends, when these look straight at each other,
-or when rays went through the step all along it.
+A cut may also meet two bodies, or the two walls of a hole, with nothing between but air. A step is no surface when what
+was measured goes on all around both of its ends, when these look straight at each other, or when rays went through all
+of it. The next widest is then asked.
 """
 
 import numpy as np
@@ -15,19 +15,19 @@ import numpy as np
 from drivers.scanline import BoolArray, Float64Array
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.boxes import Boxes
-from scanner_service.rescan.cuts import AIR, DETOUR, find_crossed, find_widest_steps
+from scanner_service.rescan.cuts import DETOUR, STEPS, find_crossed, find_steps
 from scanner_service.rescan.frames import Frames
 from scanner_service.rescan.gaps import Gaps
 from scanner_service.rescan.stations import IntArray, Stations
 
+NOTHING, AIR = -1, -2
 _FACING = 0.7  # cosine: the walls of a hole face each other, and a straight way between them is air
 _BORDER = 0.25  # centroid offset, radii: 0.42 where surface ends straight; below, it goes on all around
 _COLUMN_MM = 1.0  # side of the columns that points are found by, or ...
 _MOST_COLUMNS = 2000  # ... so wide that there are at most so many side by side
 _EVERY = 4  # one return of so many in every other line is asked for its ray
 
-_Columns = tuple[Float64Array, IntArray, Float64Array, float, int, int]
-"""Points (n, 3) column by column, where each begins (c + 1,), lowest corner (2,), side, how many in x and in y."""
+_Columns = tuple[Float64Array, IntArray, Float64Array, float, int, int]  # as `cuts` has them
 
 
 def windows_of(snapshot: MapSnapshot, gaps: Gaps, rows: IntArray, reach_mm: Float64Array) -> Boxes:
@@ -51,37 +51,55 @@ def left_by_others(
 
     Returns
     -------
-    (k, 2) rows of the snapshot, the end nearer to the gap's own laser first. NOTHING where nothing is left, AIR where
-    what is left is no surface. Gaps near which no other pass has a point keep their ends.
+    (k, 2) rows of the snapshot, the end nearer to the gap's own laser first. Gaps in whose cut no other pass has a
+    point keep their ends. NOTHING where no step of the chain is wider than two radii (or, of a short gap, three fifths
+    of it), or those that are have no border; AIR where all that have are air.
     """
     ends = np.stack([gaps.high[rows], gaps.low[rows]], axis=1).astype(np.int64)
     points = points[(snapshot.neighbours[points] > 0) & snapshot.settled[points] & ~snapshot.isolated[points]]
-    if not len(points) or not len(rows):
-        return ends
-    group = gaps.group[rows]
     start, end = snapshot.points_mm[ends[:, 0]], snapshot.points_mm[ends[:, 1]]
-    way = _unit(end - start)
+    way, group = _unit(end - start), gaps.group[rows]
     aside = np.where(gaps.across[rows, None], frames.along[group], np.cross(frames.along[group], frames.axis[group]))
     normal = _unit(aside - way * np.einsum("ij,ij->i", aside, way)[:, None])
     kept, columns = _in_columns(snapshot, points)
-    is_border = ~(snapshot.offset < _BORDER)
-    find_widest_steps(
-        columns, kept, stations.group[snapshot.line[kept]], is_border, start, end, way, normal, group, reach_mm, ends
+    steps, alone = np.repeat(ends[:, None], STEPS, axis=1), np.zeros(len(rows), dtype=np.bool_)
+    find_steps(
+        columns, kept, stations.group[snapshot.line[kept]], ~(snapshot.offset < _BORDER), start, end, way, normal,
+        group, reach_mm, steps, alone,
     )  # fmt: skip
-    found = np.flatnonzero(ends[:, 0] >= 0)
-    first, last = snapshot.points_mm[ends[found, 0]], snapshot.points_mm[ends[found, 1]]
-    air = _face_each_other(snapshot, ends[found])
+    gap, place = np.nonzero((steps[:, :, 0] >= 0) & ~alone[:, None])
+    middle, half = 0.5 * (start + end)[gap], 0.5 * DETOUR * np.linalg.norm(end - start, axis=1)[gap]
+    air = np.zeros((len(rows), STEPS), dtype=np.bool_)
+    air[gap, place] = _is_air(snapshot, points, steps[gap, place], normal[gap], reach_mm[gap], middle, half)
+    is_left: BoolArray = (steps[:, :, 0] >= 0) & ~air
+    left = steps[np.arange(len(rows)), is_left.argmax(axis=1)]
+    left[~is_left.any(axis=1)] = NOTHING
+    left[~is_left.any(axis=1) & air.any(axis=1)] = AIR
+    return _nearer_first(snapshot, np.where(alone[:, None], ends, left), snapshot.lines.laser_mm[gaps.line[rows]])
+
+
+def _is_air(
+    snapshot: MapSnapshot, points: IntArray, steps: IntArray, normal: Float64Array, reach_mm: Float64Array,
+    middle_mm: Float64Array, half_mm: Float64Array,
+) -> BoolArray:  # fmt: skip
+    """(k,) True for steps, rows (k, 2), whose ends look straight at each other, or that rays to some points cross."""
+    first, last = snapshot.points_mm[steps[:, 0]], snapshot.points_mm[steps[:, 1]]
+    way = _unit(last - first)
+    facing = np.einsum("ij,ij->i", way, snapshot.normals[steps[:, 0]]) > _FACING
+    facing &= np.einsum("ij,ij->i", way, snapshot.normals[steps[:, 1]]) < -_FACING
     some = (snapshot.index[points] % _EVERY == 0) & (snapshot.lines.line_index[snapshot.line[points]] % 2 == 0)
     kept, columns = _in_columns(snapshot, points[some])
+    crossed = np.zeros(len(steps), dtype=np.bool_)
     lasers = snapshot.lines.laser_mm[snapshot.line[kept]]
-    middle, half = 0.5 * (start + end)[found], 0.5 * DETOUR * np.linalg.norm(end - start, axis=1)[found]
-    find_crossed(columns, lasers, first, last, normal[found], reach_mm[found], middle, half, air)
-    ends[found[air]] = AIR
-    found, first, last = found[~air], first[~air], last[~air]
-    laser = snapshot.lines.laser_mm[gaps.line[rows[found]]]
-    turned = found[np.linalg.norm(first - laser, axis=1) > np.linalg.norm(last - laser, axis=1)]
-    ends[turned] = ends[turned, ::-1]
-    return ends
+    find_crossed(columns, lasers, first, last, normal, reach_mm, middle_mm, half_mm, crossed)
+    return np.asarray(facing | crossed)
+
+
+def _nearer_first(snapshot: MapSnapshot, ends: IntArray, laser_mm: Float64Array) -> IntArray:
+    """The ends (k, 2), the one nearer to a laser (k, 3) first; those that are no rows as they are."""
+    away = np.linalg.norm(snapshot.points_mm[ends] - laser_mm[:, None], axis=2)
+    turned = (ends[:, 0] >= 0) & (away[:, 0] > away[:, 1])
+    return np.asarray(np.where(turned[:, None], ends[:, ::-1], ends), dtype=np.int64)
 
 
 def _in_columns(snapshot: MapSnapshot, points: IntArray) -> tuple[IntArray, _Columns]:
@@ -90,19 +108,11 @@ def _in_columns(snapshot: MapSnapshot, points: IntArray) -> tuple[IntArray, _Col
     low = places.min(axis=0)[:2] if len(points) else np.zeros(2)
     side = max(_COLUMN_MM, float((places[:, :2] - low).max(initial=0.0)) / _MOST_COLUMNS)
     at = np.floor((places[:, :2] - low) / side).astype(np.int64)
-    wide, long = (int(one) + 1 for one in at.max(axis=0, initial=0))
-    column = at[:, 0] * long + at[:, 1]
+    many_x, many_y = (int(one) + 1 for one in at.max(axis=0, initial=0))
+    column = at[:, 0] * many_y + at[:, 1]
+    begin = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=many_x * many_y))])
     order = np.argsort(column, kind="stable")
-    start = np.searchsorted(column[order], np.arange(wide * long + 1))
-    return points[order], (places[order], start, low, side, wide, long)
-
-
-def _face_each_other(snapshot: MapSnapshot, ends: IntArray) -> BoolArray:
-    """(k,) True where the surface at both ends looks straight at the other one: the walls of a hole."""
-    way = _unit(snapshot.points_mm[ends[:, 1]] - snapshot.points_mm[ends[:, 0]])
-    facing: BoolArray = np.einsum("ij,ij->i", way, snapshot.normals[ends[:, 0]]) > _FACING
-    facing &= np.einsum("ij,ij->i", way, snapshot.normals[ends[:, 1]]) < -_FACING
-    return facing
+    return points[order], (places[order], begin, low, side, many_x, many_y)
 
 
 def _unit(vectors: Float64Array) -> Float64Array:

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from drivers.errors import DriverError
 from scanner_service.rescan.passes.errors import PlanningError
-from scanner_service.rescan.passes.recommendation import Plan, RecommendedPass
+from scanner_service.rescan.passes.recommendation import Plan
 from scanner_service.rescan.passes.serving import EVERYTHING, Serving
 from scanner_service.rescan.region import RegionStatus, RescanRegion
 from scanner_service.sessions.errors import PlanOvertaken, SessionError
@@ -107,8 +107,10 @@ def _step(desk: LoopDesk, loop: LoopState) -> str | None:
         return done
     plan = desk.plan(limits.serving)
     drivable = [one for one in plan.passes if one.turn is None or one.turn.is_none]
-    if not _wanted(results, limits) and _may_be_hidden_mm2(drivable) < _HIDDEN * float(results.coverage.area_mm2.sum()):
-        return _HOLDS
+    if _share(results, limits) is None and not _wanted(results, limits):
+        expected_mm2 = sum(one.gain_mm2 for one in drivable)  # where there is no region they only explore
+        if expected_mm2 < _HIDDEN * float(results.coverage.area_mm2.sum()):
+            return _HOLDS
     if not drivable:
         return _nothing_left(desk.judged(), plan)
     best = drivable[0]
@@ -136,7 +138,7 @@ def _step(desk: LoopDesk, loop: LoopState) -> str | None:
 
 def _fulfilled(results: Results, limits: LoopLimits) -> str | None:
     """Why nothing more is wanted, or None."""
-    share = limits.coverage_share if limits.coverage_share is not None else results.requirement.coverage_share
+    share = _share(results, limits)
     if share is not None:
         kind = "observed coverage" if results.reference is None else "coverage of the nominal part"
         return f"the {kind} of {share:.1%} is reached" if results.share >= share else None
@@ -145,13 +147,13 @@ def _fulfilled(results: Results, limits: LoopLimits) -> str | None:
     return _HOLDS
 
 
+def _share(results: Results, limits: LoopLimits) -> float | None:
+    """The coverage asked for, if one is."""
+    return limits.coverage_share if limits.coverage_share is not None else results.requirement.coverage_share
+
+
 def _wanted(results: Results, limits: LoopLimits) -> list[RescanRegion]:
     return [region for region in results.regions if limits.serving.wants(region)]
-
-
-def _may_be_hidden_mm2(passes: list[RecommendedPass]) -> float:
-    """What passes expect to find, where there is no region that they could serve."""
-    return sum(one.gain_mm2 for one in passes)
 
 
 def _nothing_left(results: Results, plan: Plan) -> str:

@@ -4,6 +4,7 @@ import gc
 import threading
 
 from scanner_service.analysis.compiling import compile_kernels
+from scanner_service.rescan.cuts import compile_cuts
 from scanner_service.rescan.passes.compiling import compile_planner
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.kernel_caches import mark_used, remove_unused
@@ -30,6 +31,7 @@ def warm_up() -> None:
             mark_used()
             compile_packing()
             snapshot = compile_kernels()
+            compile_cuts()
             compile_planner(snapshot, judge(snapshot, Requirement()).report)
             mark_used()  # it may not have been there before
             remove_unused()

@@ -224,6 +224,7 @@ def _floors(
     gaps = report.gaps
     rows = np.flatnonzero(np.isin(gaps.kind, (GapKind.SHADOW, GapKind.FLANK)))
     high, low = gaps.high[rows], gaps.low[rows]
+    # of a shadow seen in part the lower end is another pass's: its own ray guesses right more often than the gap's
     ray = snapshot.points_mm[low] - snapshot.lines.laser_mm[snapshot.line[low]]
     ray /= np.linalg.norm(ray, axis=1, keepdims=True) if len(ray) else 1.0
     normal = np.where(np.isfinite(snapshot.normals[low]), snapshot.normals[low], -ray)

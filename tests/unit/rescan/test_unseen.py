@@ -8,11 +8,10 @@ from scipy.spatial import cKDTree
 
 from drivers.scanline import Pose
 from scanner_service.rescan.coverage import observed_coverage
-from scanner_service.rescan.cuts import NOTHING
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.requirement import Interest, Requirement
-from scanner_service.rescan.unseen import left_by_others, windows_of
+from scanner_service.rescan.unseen import NOTHING, left_by_others, windows_of
 from simulators.shapes import Cylinder, Difference, Union, box
 from tests.unit.rescan.passes.posed_scans import FROM_ABOVE, Bench
 

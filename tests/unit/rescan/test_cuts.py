@@ -1,0 +1,127 @@
+"""Chains of points across a gap: their widest steps, whatever the radius, and the rays through them."""
+
+import numpy as np
+import pytest
+from numba import typeof
+
+from scanner_service.rescan import cuts, unseen
+from scanner_service.rescan.cuts import STEPS, compile_cuts, find_crossed, find_steps
+from scanner_service.rescan.regions import find_regions
+from tests.unit.rescan.synthetic_scan import snapshot_of, straight_down
+
+
+def in_one_column(places: np.ndarray) -> tuple:
+    return places, np.array([0, len(places)]), np.full(2, -1e3), 2e3, 1, 1
+
+
+def steps_of(places: np.ndarray, borders: np.ndarray, start: list[float], end: list[float], reach: float) -> np.ndarray:
+    """The steps, as rows of the places, of which the last two are the start and the end; y is normal to the cut."""
+    places = np.vstack([places, start, end])
+    n = len(places)
+    starts, ends = places[[n - 2]], places[[n - 1]]
+    way = (ends - starts) / np.linalg.norm(ends - starts)
+    found, alone = np.full((1, STEPS, 2), (n - 2, n - 1)), np.zeros(1, dtype=bool)
+    find_steps(
+        in_one_column(places), np.arange(n), np.ones(n, dtype=np.int64), np.append(borders, [True, True]), starts, ends,
+        way, np.array([[0.0, 1.0, 0.0]]), np.zeros(1, dtype=np.int64), np.array([reach]), found, alone,
+    )  # fmt: skip
+    assert not alone[0]
+    return found[0]
+
+
+def corner(height: float, width: float, spacing: float) -> np.ndarray:
+    """A wall from the top down to the floor, and the floor on from there."""
+    z, x = np.arange(0.0, height, spacing), np.arange(0.0, width, spacing)
+    wall = np.column_stack([0 * z, 0 * z, -z])
+    return np.vstack([wall, np.column_stack([x, 0 * x, np.full_like(x, -height)])])
+
+
+@pytest.mark.parametrize("longer", [10, 67, 100, 150, 400])
+@pytest.mark.parametrize("reach", [0.02, 0.3, 5.0])
+def test_a_gap_of_any_length_whose_wall_and_floor_are_seen_has_nothing_left(longer: int, reach: float) -> None:
+    length = longer * reach
+    height, width = 0.8 * length, 0.6 * length
+    seen = corner(height, width, 0.7 * reach)
+    steps = steps_of(seen, np.ones(len(seen), dtype=bool), [0.0, 0.0, 0.0], [width, 0.0, -height], reach)
+    assert (steps < 0).all()
+
+
+@pytest.mark.parametrize("longer", [10, 67, 150, 400])
+def test_what_is_missing_of_the_floor_is_the_step(longer: int) -> None:
+    reach = 0.3
+    height, width = 0.8 * longer * reach, 0.6 * longer * reach
+    seen = corner(height, width, 0.7 * reach)
+    on_floor = seen[:, 2] <= -height
+    seen = seen[~(on_floor & (seen[:, 0] > 0.3 * width) & (seen[:, 0] < 0.7 * width))]
+    steps = steps_of(seen, np.ones(len(seen), dtype=bool), [0.0, 0.0, 0.0], [width, 0.0, -height], reach)
+    assert (steps[1:] < 0).all()
+    ends = np.sort(seen[steps[0], 0])
+    assert ends == pytest.approx([0.3 * width, 0.7 * width], abs=0.01 * longer * reach + reach)
+
+
+def test_behind_a_wider_step_without_a_border_the_missing_floor_is_told() -> None:
+    """Two bodies in the cut, 5 mm apart and seen on all sides, and 3 mm of floor that nobody saw."""
+    x = np.concatenate([np.arange(0.0, 3.0, 0.2), np.arange(8.0, 11.0, 0.2), np.arange(14.0, 16.0, 0.2)])
+    places = np.column_stack([x, 0 * x, 0 * x])
+    borders = (np.abs(x - 10.8) < 0.05) | (np.abs(x - 14.0) < 0.05)
+    steps = steps_of(places, borders, [0.0, 0.0, 0.0], [16.0, 0.0, 0.0], 0.3)
+    assert x[steps[0]] == pytest.approx([10.8, 14.0])
+    assert (steps[1:] < 0).all()
+    whole = steps_of(places, np.ones(len(x), dtype=bool), [0.0, 0.0, 0.0], [16.0, 0.0, 0.0], 0.3)
+    assert x[whole[0]] == pytest.approx([2.8, 8.0]) and x[whole[1]] == pytest.approx([10.8, 14.0])
+
+
+@pytest.mark.parametrize(
+    ("laser", "through"),
+    [
+        ([0.0, 0.0, 90.0], True),  # from above, onto a floor below the step
+        ([90.0, 0.0, 0.0], False),  # along the step: it is looked past, not through
+        ([0.0, 90.0, -2.5], False),  # all on one side of it
+    ],
+)
+def test_rays_go_through_a_step_and_not_past_it(laser: list[float], through: bool) -> None:
+    x = np.arange(-3.0, 3.0, 0.1)
+    floor = np.column_stack([x, 0 * x, np.full_like(x, -2.0)])
+    first, last = np.array([[-2.0, 0.0, 0.0]]), np.array([[2.0, 0.0, 0.0]])
+    crossed = np.zeros(1, dtype=bool)
+    find_crossed(
+        in_one_column(floor), floor * [1.0, 1.0, 0.0] + laser, first, last, np.array([[0.0, 1.0, 0.0]]),
+        np.array([0.3]), 0.5 * (first + last), np.array([5.0]), crossed,
+    )  # fmt: skip
+    assert crossed[0] == through
+
+
+def test_fewer_rays_than_strays_may_be_go_through_nothing() -> None:
+    floor = np.array([[-1.5, 0.0, -2.0], [-1.4, 0.0, -2.0], [1.5, 0.0, -2.0], [1.4, 0.0, -2.0], [0.0, 0.0, -2.0]])
+    first, last, crossed = np.array([[-2.0, 0.0, 0.0]]), np.array([[2.0, 0.0, 0.0]]), np.zeros(1, dtype=bool)
+    rest = (
+        floor * [1.0, 1.0, -45.0],
+        first,
+        last,
+        np.array([[0.0, 1.0, 0.0]]),
+        np.array([0.3]),
+        first,
+        np.array([9.0]),
+    )
+    find_crossed(in_one_column(floor), *rest, crossed)
+    assert not crossed[0]
+
+
+def test_what_is_compiled_before_a_scan_is_what_a_scan_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+    called: dict[str, list[object]] = {"find_steps": [], "find_crossed": []}
+    for name, calls in called.items():
+        kernel = getattr(cuts, name)
+
+        def kept(*arguments, kernel=kernel, calls=calls):
+            calls.append(tuple(typeof(one) for one in arguments))
+            return kernel(*arguments)
+
+        monkeypatch.setattr(cuts, name, kept)
+        monkeypatch.setattr(unseen, name, kept)
+    compile_cuts()
+    cliff, x, y = (lambda x, y: np.where(y < 4.0, 0.0, 6.0)), np.arange(0.0, 6.0, 0.2), np.arange(0.0, 8.0, 0.3)
+    scan = straight_down(cliff, x, y, 0.3).joined(straight_down(cliff, x, y + 0.15, 0.3, pass_number=2))
+    find_regions(snapshot_of(scan))
+    for calls in called.values():
+        assert len(calls) >= 2
+        assert len(set(calls)) == 1
