@@ -56,8 +56,10 @@ class SessionBook:
         clock: Callable[[], datetime] = utc_now,
         meshes: Path | None = None,
         rigs: Path | None = None,
+        check_ready: Callable[[], None] = lambda: None,
     ) -> None:
         self.record = record
+        self._check_ready = check_ready  # raises what whoever wants a session opened is to be told instead
         self._meshes = meshes  # the folder in which reference meshes lie
         self._rigs = rigs  # the folder in which rig files lie
         self.retention = retention or Retention()
@@ -97,6 +99,7 @@ class SessionBook:
         Raises
         ------
         SessionBusy : too many sessions are open, or the same request is being carried out.
+        KernelsCompiling : it is too early to open one.
         BudgetSpent : the disk budget is used up.
         SourceUnusable, DriverError : the source cannot be opened; no session was made.
         CreationKeyReused : the key came before, with another request.
@@ -148,6 +151,7 @@ class SessionBook:
         key: CreationKey | None,
         reference: ReferenceSurface | None,
     ) -> LiveSession:
+        self._check_ready()
         self.make_room_on_disk()
         with self._place_kept():
             opened = self._open(spec) if source is None else source
@@ -216,6 +220,7 @@ class SessionBook:
         ------
         SessionUnknown : there is none.
         SessionBusy : too many sessions are open.
+        KernelsCompiling : it is too early to open one.
         """
         while True:
             live = self._live.get(session_id)
@@ -230,6 +235,7 @@ class SessionBook:
                 opening = self._opening.get(session_id)
                 if opening is None:
                     row = self.record.get_session(session_id)
+                    self._check_ready()
                     self._make_room()
                     mine = self._opening[session_id] = Opening(self.record.count(session_id).lines)
                     break
