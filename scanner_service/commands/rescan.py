@@ -91,9 +91,12 @@ def _one(client: httpx.Client, where: str, number: int, plan: str, turned: bool,
     order = _ask(client.post(f"{where}/recommended-passes/{number}/accept", params=serving, json={"plan": plan}))
     mine = f"{where}/pass-orders/{order['order']}"
     errors.print(f"order {order['order']}: {_said(order)}", highlight=False, soft_wrap=True)
-    if turned and order["pass"]["turn_part"] is None:
+    turn = order["pass"]["turn_part"]
+    if turned != (turn is not None):  # nothing moved yet, and the same command can be given again
         client.delete(mine)
-        fail(f"pass {number} of plan {plan} asks for no turn of the part: leave out --turned")
+        if turn is None:
+            fail(f"pass {number} of plan {plan} asks for no turn of the part: leave out --turned")
+        fail(f"first {turn}; then give the same command with --turned (nothing moved, order {order['order']} is gone)")
     _ask(client.post(f"{mine}/carry-out", json={"part_is_turned": turned}))
     by_hand = _ask(client.get(where))["source"]["kind"] == "push"
     said = ""

@@ -19,7 +19,7 @@ from scanner_service.rescan.passes.tried import Tried
 from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.closed_loop import LoopLimits, LoopState, run
-from scanner_service.sessions.errors import SessionBusy, SessionError, SourceUnusable
+from scanner_service.sessions.errors import PartNotTurned, SessionBusy, SessionError, SourceUnusable
 from scanner_service.sessions.pass_orders import (
     ACCEPTED,
     CANCELLED,
@@ -122,7 +122,7 @@ class PassDesk:
         """Drive an accepted pass; pushed scanlines are waited for where a client or a hand moves the scanner.
 
         A refused order is cancelled with the reason, whoever gave it; accept it again when that is mended. One whose
-        devices do not set off has failed, with the reason.
+        devices do not set off has failed, with the reason. One for which only the operator's word is missing waits on.
 
         Parameters
         ----------
@@ -131,12 +131,13 @@ class PassDesk:
         Raises
         ------
         PassUnknown, SessionBusy : there is no such order, or the session or the order is in another state.
+        PartNotTurned : the pass asks for a turn of the part; the order is as it was.
         PlanningError : the rig cannot carry it out.
         SourceUnusable, DriverError : the pass could not be started.
         """
-        order = self._claimed(order_id)
+        order = self._claimed(order_id, part_is_turned)
         try:
-            before, setup = self._begun(order, part_is_turned)
+            before, setup = self._begun(order)
         except Exception as error:
             self._not_begun(order, error)
             raise
@@ -273,13 +274,21 @@ class PassDesk:
                     self._plan, self._planned_for, self._planned_against = plan, wanted, nominal
                     return plan, results
 
-    def _claimed(self, order_id: int) -> PassOrder:
-        """The order, now being set off; raises SessionBusy, and cancels it when that is for another on its way."""
+    def _claimed(self, order_id: int, part_is_turned: bool) -> PassOrder:
+        """The order, now being set off; raises PartNotTurned and leaves it, or SessionBusy.
+
+        It is cancelled where that is for another on its way.
+        """
         with self._lock:
             order = self._orders.get(order_id)
             if order.status is not PassStatus.ACCEPTED or self._setting_off == order_id:
                 state = "being set off" if self._setting_off == order_id else order.status.value
                 raise SessionBusy(f"pass order {order_id} is {state}: accept a pass of a new plan")
+            turn = order.planned.turn
+            if turn is not None and not turn.is_none and not part_is_turned:
+                raise PartNotTurned(
+                    f'first {turn}; then carry pass order {order_id} out with {{"part_is_turned": true}}: it waits on'
+                )
             running = self._orders.running()
             other = self._setting_off if running is None else running.order_id
             if other is not None:
@@ -314,14 +323,8 @@ class PassDesk:
             self._task(-1)
             order.done.set()
 
-    def _begun(self, order: PassOrder, part_is_turned: bool) -> tuple[Results, RigSetup]:
+    def _begun(self, order: PassOrder) -> tuple[Results, RigSetup]:
         """Start the pass of an order; the verdict before it, and the rig that it goes with. Raises as `carry_out`."""
-        turn = order.planned.turn
-        if turn is not None and not turn.is_none and not part_is_turned:
-            raise SessionBusy(
-                f"first {turn}; then accept the pass again and carry it out, saying that the part is turned "
-                '(--turned, or "part_is_turned": true)'
-            )
         before = self._session.fresh_results()
         setup, planned = self._setup_now(before), order.planned
         setup.reach.check(planned.motion, planned.start_mm, planned.end_mm, planned.line_spacing_mm)

@@ -67,7 +67,7 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     assert unclear.status_code == 409 and "reach_mm" in unclear.json()["detail"]
 
 
-def test_a_refused_pass_is_cancelled_and_says_what_to_do(running, service):
+def test_a_pass_of_a_part_that_must_be_turned_says_what_to_do_and_costs_no_order(running, service):
     simulator = running.simulator("step")
     body = {
         "name": "shadowed",
@@ -90,8 +90,9 @@ def test_a_refused_pass_is_cancelled_and_says_what_to_do(running, service):
     order = service.client.post(f"{where}/recommended-passes/{turned['number']}/accept?reason=shadow",
                                 json={"plan": plan["plan"]}).json()["order"]  # fmt: skip
     begun = service.client.post(f"{where}/pass-orders/{order}/carry-out", json={"part_is_turned": False})
-    assert begun.status_code == 409 and "accept the pass again" in begun.json()["detail"]
+    assert (begun.status_code, begun.json()["type"]) == (409, "/problems/part-not-turned")
+    assert '{"part_is_turned": true}' in begun.json()["detail"]
     told = service.client.get(f"{where}/pass-orders/{order}").json()
-    assert (told["status"], told["message"]) == ("cancelled", begun.json()["detail"])
+    assert (told["status"], told["message"]) == ("accepted", None)
     unknown = service.client.get(f"{where}/recommended-passes?region=4711")
     assert unknown.status_code == 404 and "no region 4711" in unknown.json()["detail"]

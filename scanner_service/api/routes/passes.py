@@ -74,10 +74,11 @@ def get_order(desk: Desk, order: int) -> Response:
 def carry_out(desk: Desk, order: int, body: CarryOutIn = CarryOutIn()) -> Response:  # noqa: B008 - it is frozen
     """Drive an accepted pass, or wait for the scanlines that a hand brings. The laser is switched on.
 
-    It may come without a body: then the part is not turned.
+    It may come without a body: then the part is not turned. Where the pass asks for a turn, that is refused and the
+    order waits on.
 
-    An order that is refused is cancelled, and one whose devices do not set off has failed, with the reason as its
-    message.
+    An order that is refused for another reason is cancelled, and one whose devices do not set off has failed, with the
+    reason as its message.
     """
     return answer(desk.carry_out(order, body.part_is_turned).to_dict())
 
