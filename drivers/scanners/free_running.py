@@ -156,7 +156,7 @@ class FreeRunner:
             if self._host is None:
                 return Tally()
             tally = self._host.tally()
-            return tally if self._link is None else self._link.with_overruns(tally)
+            return tally if self._link is None else self._link.with_reading(tally)
 
     def exit(self) -> None:
         """Stop, switch the laser off, close the port; never raises, and returns within about 2 s."""

@@ -214,7 +214,7 @@ class NativeScanner:
         with self._changed:
             stream = self._host.stream
             tally = stream.tally() if stream is not None else Tally()
-            return tally if self._link is None else self._link.with_overruns(tally)
+            return tally if self._link is None else self._link.with_reading(tally)
 
     def exit(self) -> None:
         """Stop the pass, switch the laser off, close the port; never raises, and returns within about 2 s."""

@@ -47,6 +47,8 @@ errors = paper(sys.stderr, os.environ)
 _MADE: ContextVar[tuple[Path, ...]] = ContextVar("folders that the command has made", default=())
 _UNWANTED = {"outside_pass", "between_stops", "before_start"}
 """Reasons of lines that a scanner made while its stage turned or went to the next stop: no loss."""
+_NOT_READ = {"host_overflow", "overflow", "queue_full"}
+"""Reasons of lines that came, and that this computer had no time for."""
 
 EXPECTED = (
     httpx.HTTPError,
@@ -215,9 +217,21 @@ def loss_sentence(losses: Mapping[str, Any]) -> str:
     said = [f"of {sent:,} scanlines {partial:,} are partial", f"{lost.total():,} lost{_by_reason(lost)}"]
     if chunks.total():
         said.append(f"of {sent_chunks:,} chunks {chunks.total():,} were lost{_by_reason(chunks)}")
-    helps = "device_dropped" in lost or "device_dropped" in chunks
-    advice = " The scanner measured more than its wire carries: a slower pass or a lower line rate helps."
-    return f"Losses: {', '.join(said)}.{advice if helps else ''}"
+    return " ".join((f"Losses: {', '.join(said)}.", *_advice({*lost, *chunks}, losses.get("device") or {})))
+
+
+def _advice(reasons: set[str], device: Mapping[str, Any]) -> Iterator[str]:
+    """What helps, by what was counted: a scanner drops what its wire does not carry, and what nobody reads."""
+    late, dropped = device.get("late_reads", 0), "device_dropped" in reasons
+    carried_hz = device.get("wire_line_rate_hz")
+    wire_has_time = carried_hz is not None and device["line_rate_hz"] <= carried_hz
+    if dropped and not wire_has_time:
+        yield "The scanner measured more than its wire carries: a slower pass or a lower line rate helps."
+    elif dropped and not late:
+        yield "The scanner dropped lines that its wire has time for: a slower pass or a lower line rate helps."
+    if reasons & _NOT_READ or "uart_overrun" in device.get("damage", {}) or (dropped and late):
+        times = f" ({late:,} times it came late, by up to {device['largest_pause_s']:.1f} s)" if late else ""
+        yield f"This computer was too busy to read in time what came{times}: close other programs, or scan more slowly."
 
 
 def _lost(passes: Iterable[Mapping[str, Any]]) -> "Counter[str]":
