@@ -7,7 +7,7 @@ import os
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
@@ -191,6 +191,27 @@ class WorkProgress:
     def show(self, what: str, share: float) -> None:
         """Show what is being done, and the share of it that is done."""
         self._bar.update(self._task, completed=share, description=f"{self._title}: {what}")
+
+
+@contextlib.contextmanager
+def waiting_for(said: str) -> Iterator[Callable[[str], None]]:
+    """Say what is being waited for, and what next, on standard error: on a terminal as long as it lasts.
+
+    On something that is no terminal each is a line of its own, once.
+    """
+    told = said
+
+    def say(now: str) -> None:
+        nonlocal told
+        if now != told and not errors.is_terminal:
+            errors.print(now, highlight=False, soft_wrap=True)
+        told = now
+        shown.update(now)
+
+    if not errors.is_terminal:
+        errors.print(said, highlight=False, soft_wrap=True)
+    with errors.status(said) as shown:
+        yield say
 
 
 def lost_lines(losses: Mapping[str, Any]) -> int:

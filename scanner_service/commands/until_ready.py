@@ -4,7 +4,7 @@ import time
 
 import httpx
 
-from scanner_service.commands.terminal import errors, fail
+from scanner_service.commands.terminal import fail, waiting_for
 
 SAID = "compiling kernels (only the first time) …"
 _COMPILING_S = 600.0
@@ -16,11 +16,9 @@ def wait_until_ready(client: httpx.Client) -> None:
     if _says_ready(client) is None:
         return
     begun_s = time.monotonic()
-    if not errors.is_terminal:
-        errors.print(SAID)
-    with errors.status(SAID) as shown:
+    with waiting_for(SAID) as say:
         while (said := _says_ready(client)) is not None:
-            shown.update(said)
+            say(said)
             if time.monotonic() - begun_s > _COMPILING_S:
                 fail("the service did not become ready in ten minutes: run it again, what was compiled is kept")
             time.sleep(_POLL_S)

@@ -30,8 +30,10 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     listed = rescan(service, session_id)
     assert listed.returncode == 0, listed.stderr
     assert json.loads(listed.stdout)["passes"][0]["line_spacing_mm"] < 0.8
+    assert listed.stderr.startswith("planning passes …\n")  # which may take its time on a busy machine
     looped = rescan(service, session_id, "--auto", "--max-passes", "1")
     assert looped.returncode == 0, looped.stderr
+    assert looped.stderr.startswith("planning passes …\n")
     result = json.loads(looped.stdout)
     assert result["loop"]["why_ended"]
     first = result["orders"][0]

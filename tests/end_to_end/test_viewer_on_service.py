@@ -346,7 +346,15 @@ def test_what_is_asked_for_is_set_on_the_page_and_a_hand_is_guided_along_the_pas
     page.tab.click("#nominal-none")
     page.until("document.querySelector('#figures').textContent.includes('Observed coverage')")
 
+    page.tab.evaluate("""() => {
+        globalThis.planNotes = [];
+        const watched = document.querySelector("#plan-note");
+        new MutationObserver(() => planNotes.push(watched.textContent)).observe(watched, { childList: true });
+    }""")
     page.tab.click("#find-passes")
+    page.until("document.querySelector('#passes .pass') !== null")
+    notes = page.tab.evaluate("planNotes")
+    assert notes[0].startswith("Planning passes…") and notes[-1] == ""  # said until the plan is there, and no longer
     for fate in ("cancelled", "running"):
         page.tab.click("#passes .pass:first-child button:has-text('Accept')")
         page.tab.click("#orders button:has-text('" + ("Cancel" if fate == "cancelled" else "Carry out") + "')")
