@@ -19,7 +19,7 @@ from scanner_service.api.keys import read_local_key
 from scanner_service.api.login import login_url
 from scanner_service.api.server import ServerThread
 from scanner_service.api.service import Service
-from scanner_service.commands.demo_loop import watch_loop
+from scanner_service.commands.demo_loop import demo_name, watch_loop
 from scanner_service.commands.terminal import (
     check_folder,
     console,
@@ -95,7 +95,7 @@ def scan(client: httpx.Client, part: str, simulator: dict[str, Any]) -> str:
     """Run one live session to its end, showing its progress; the session's id."""
     first_mm, last_mm = simulator["travel_mm"]
     request = {
-        "name": f"demo: {part}",
+        "name": demo_name("demo", part),
         "source": {
             "kind": "device",
             "port": simulator["port"],
