@@ -53,6 +53,7 @@ class PassDesk:
         self._changes = 0  # of what plans are made from
         self._setup: RigSetup | None = None
         self._plan: Plan | None = None
+        self._marked: Plan | None = None  # what was told of regions is told by this one
         self._planned_for: tuple[object, ...] = ()  # what is served, and what is asked for
         self._planned_against: ReferenceSurface | None = None  # the nominal part
         self._orders = OrderBook()
@@ -84,6 +85,11 @@ class PassDesk:
         """
         with self._planning:
             return self._planned(serving or EVERYTHING)
+
+    def foretell(self, serving: Serving | None = None) -> Plan:
+        """The same for whoever only looks: no region is marked, nothing is written; raises as `plan`."""
+        with self._planning:
+            return self._current_plan(serving or EVERYTHING)[0]
 
     def accept(self, number: int, serving: Serving | None = None, seen: str | None = None) -> PassOrder:
         """Take an order for a pass of the plan in force.
@@ -196,10 +202,9 @@ class PassDesk:
         latest = self._session.hearing.latest_lines()
         if not latest:
             raise SessionBusy("no scanline has come yet: switch the scanner on and move it over the part")
-        line, at_s = latest[-1]
-        speed = float("nan")
-        if len(latest) > 1 and at_s > latest[0][1]:
-            speed = float(np.linalg.norm(line.laser_mm - latest[0][0].laser_mm)) / (at_s - latest[0][1])
+        (first, since_s), (line, at_s) = latest[0], latest[-1]
+        way_mm = float(np.linalg.norm(line.laser_mm - first.laser_mm))
+        speed = way_mm / (at_s - since_s) if at_s > since_s else float("nan")
         laser = self._setup_now().optics.geometry.laser_mm
         return guide(order.planned, laser, line.laser_mm, line.plane_normal, speed)
 
@@ -222,8 +227,7 @@ class PassDesk:
     # -- inside -------------------------------------------------------------------------------------------------
 
     def _setup_now(self, results: Results | None = None) -> RigSetup:
-        with self._lock:
-            known = self._setup
+        known = self._setup
         if known is None:
             results = results or self._session.results() or self._session.fresh_results()
             found = setup_of(self._session, results.snapshot, self._rigs)
@@ -249,12 +253,13 @@ class PassDesk:
     def _planned(self, serving: Serving) -> Plan:
         """See `plan`; one thread at a time comes here."""
         plan, results = self._current_plan(serving)
-        if results is not None and serving == EVERYTHING:
+        if serving == EVERYTHING and self._marked is not plan:
+            self._marked = plan
             self._mark(results, plan)
         return plan
 
-    def _current_plan(self, serving: Serving) -> tuple[Plan, Results | None]:
-        """The plan for the map as it is, and the verdict it was made from where it was made just now.
+    def _current_plan(self, serving: Serving) -> tuple[Plan, Results]:
+        """The plan for the map as it is, and the verdict on it.
 
         It is made without the lock, so that whoever asks meanwhile of orders is answered; made again when what it was
         made from has changed meanwhile.
@@ -266,7 +271,7 @@ class PassDesk:
                 known, changes = self._plan, self._changes
                 is_same = self._planned_for == wanted and self._planned_against is nominal
                 if known is not None and known.version == results.report.version and is_same:
-                    return known, None
+                    return known, results
                 question = self._question(results, setup, serving)
             plan = question.answered()
             with self._lock:

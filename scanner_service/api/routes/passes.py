@@ -44,8 +44,11 @@ def state_rig(desk: Desk, body: RigIn) -> Response:
 
 @router.get("/recommended-passes", dependencies=[viewer])
 def list_passes(desk: Desk, serving: Served) -> Response:
-    """The recommended passes for the map as it is, the best for its time first, and what none of them can bring."""
-    plan = desk.plan(serving)
+    """The recommended passes for the map as it is, the best for its time first, and what none of them can bring.
+
+    Nothing is changed by that: regions that no pass can bring are marked when a pass is accepted or a loop plans.
+    """
+    plan = desk.foretell(serving)
     return answer({"plan": name_of(plan)} | plan.to_dict())
 
 
