@@ -216,6 +216,24 @@ def test_while_a_session_is_made_another_is_opened_and_its_place_is_kept(book, s
     assert book.get(made.row.session_id) is made
 
 
+def test_while_a_session_is_closed_to_make_room_nobody_waits_but_who_wants_that_one(book, monkeypatch, aside):
+    old, kept = (book.create(name, PushSpec(), SETTINGS) for name in ("old", "kept"))
+    old.start()
+    old.stop()
+    monkeypatch.setattr("scanner_service.sessions.book.MAX_LIVE", 2)
+    reached, done = crossing(monkeypatch, old, "close")
+    making = aside(book.create, "new", PushSpec(), SETTINGS)
+    assert reached.wait(60)
+    assert aside(book.get, kept.row.session_id).result(60) is kept
+    assert aside(book.pass_desk, kept).result(60) is book.pass_desk(kept)
+    asking = aside(book.get, old.row.session_id)
+    assert not asking.done()
+    done.set()
+    assert making.result(60).row.name == "new"
+    with pytest.raises(SessionBusy, match="scanning or waiting"):  # its place is taken
+        asking.result(60)
+
+
 def test_while_a_session_is_deleted_another_is_opened_and_it_is_gone_for_all(book, stored, monkeypatch, aside):
     session_id = book.create("gone", PushSpec(), SETTINGS).row.session_id
     reached, done = crossing(monkeypatch, book.record, "delete_session")
