@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field
+from pydantic.config import JsonDict
 
 from drivers.rig_limits import AxisKind, RigLimits
 from drivers.scanline import SensorGeometry
@@ -18,7 +19,7 @@ from scanner_service.sessions.closed_loop import LoopLimits
 from scanner_service.sessions.rig_setups import RigSetup, optics_stated
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-RIG_OF_A_RECORDING = {
+RIG_OF_A_RECORDING: JsonDict = {
     "axis": "free_pose",
     "scanner": {
         "laser_mm": [0, 0, 150],
