@@ -34,7 +34,7 @@ _PAPER = "#f6f6f4"
 _INK = "#222222"
 _DOWN = np.array([0.0, 0.0, -1.0])
 _PIXELS = 900
-_LABELS = 20
+_LABELS = 24
 """So many regions are named, the most urgent ones; more than that nobody can read, and the others are drawn thinner."""
 _LEAST_REACHES = 12.0
 """The picture is at least so many times as wide and high as the reach of one point."""
@@ -90,7 +90,7 @@ def density_figure(
 
     The scale is absolute, in points per mm², over most of the judged points, with what is required in the middle of the
     colours. Points that are not reliable or not settled are grey. Regions, the most urgent first, are outlined with a
-    line style for each reason, and the first twenty are numbered.
+    line style for each reason, and the first twenty-four are numbered.
 
     Parameters
     ----------

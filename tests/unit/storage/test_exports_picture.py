@@ -128,13 +128,13 @@ def test_of_many_regions_the_most_urgent_are_named_and_the_picture_says_how_many
         regions = [Region(100 + k, "sparse", (square + corner,)) for k, corner in enumerate(corners)]
         figure = density_figure(plate(), regions, session_name="crowd")
         named = [text.get_text() for text in figure.axes[0].texts]
-        assert named == [str(region.number) for region in regions[:20]]
+        assert named == [str(region.number) for region in regions[:24]]
         lines = [line for line in figure.axes[0].lines if line.get_path_effects()]
         assert len(lines) == count  # all are outlined, those without a name more thinly
-        assert {line.get_linewidth() > 1.0 for line in lines[20:]} <= {False}
+        assert {line.get_linewidth() > 1.0 for line in lines[24:]} <= {False}
         (legend,) = figure.legends
         remark = legend.get_title().get_text()
-        assert ("of 62 regions the 20 most urgent are named, the 42 others" in remark) == (count == 62)
+        assert ("of 62 regions the 24 most urgent are named, the 38 others" in remark) == (count == 62)
 
 
 def test_an_empty_map_and_a_single_point_have_a_picture_too():
