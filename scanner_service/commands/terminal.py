@@ -251,8 +251,9 @@ def _advice(reasons: set[str], device: Mapping[str, Any]) -> Iterator[str]:
     elif dropped and not late:
         yield "The scanner dropped lines that its wire has time for: a slower pass or a lower line rate helps."
     if reasons & _NOT_READ or "uart_overrun" in device.get("damage", {}) or (dropped and late):
-        times = f" ({late:,} times it came late, by up to {device['largest_pause_s']:.1f} s)" if late else ""
-        yield f"This computer was too busy to read in time what came{times}: close other programs, or scan more slowly."
+        often = "once" if late == 1 else f"{late:,} times"
+        when = f" (late {often}, by up to {device['largest_pause_s']:.1f} s)" if late else ""
+        yield f"This computer was too busy to read in time what came{when}: close other programs, or scan more slowly."
 
 
 def _lost(passes: Iterable[Mapping[str, Any]]) -> "Counter[str]":

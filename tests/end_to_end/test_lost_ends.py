@@ -58,11 +58,12 @@ def test_lines_lost_at_the_end_of_a_pass_are_counted_and_told_where(tmp_path, re
         assert session.wait_until_over(120.0)
         said = session.status().message
         told = [event.details for event in record.events(session.row.session_id) if event.kind == LOST_END]
-        (account,) = session.losses()["passes"]
+        (account,), device = session.losses()["passes"], session.losses()["device"]
         book.close()
     assert account["lines"]["sent"] == LINES
     assert account["lines"]["stored"] == LINES - lost
     assert sum(account["lines"]["lost"].values()) == lost
+    assert device["largest_pause_s"] > 0.0 and device["late_reads"] >= 0  # also when the port is closed
     if not lost:
         assert (said, told) == (None, [])
         return

@@ -64,7 +64,8 @@ def _read(line_rate_hz=None, late_reads=0, **device):
 @pytest.mark.parametrize(
     ("device", "scanner", "computer"),
     [
-        (_read(50.0, late_reads=3), "", "(3 times it came late, by up to 1.3 s)"),
+        (_read(50.0, late_reads=3), "", "(late 3 times, by up to 1.3 s)"),
+        (_read(50.0, late_reads=1), "", "(late once, by up to 1.3 s)"),
         (_read(90.0), "wire carries", ""),
         (_read(90.0, late_reads=3), "wire carries", "by up to 1.3 s"),
         (_read(50.0), "has time for", ""),
