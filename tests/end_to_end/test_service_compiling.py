@@ -8,8 +8,7 @@ import sys
 import httpx
 import pytest
 
-from scanner_service.commands.until_ready import wait_until_ready
-from scanner_service.sessions.readiness import STEPS, preparing, refuse_until_ready, warm_up
+from scanner_service.sessions.readiness import STEPS
 from tests.end_to_end.running import PATIENCE_S, ROOT
 
 
@@ -46,13 +45,3 @@ def test_whoever_wants_a_session_before_all_is_compiled_is_told_when_to_come_aga
     told = ready.json()["preparing"]
     assert told["what"] == STEPS[told["step"] - 1] and told["of"] == len(STEPS) and told["seconds"] >= 0.0
     assert fresh.get("/api/v1/sessions").json()["sessions"] == []  # none was made, and the list does not wait
-
-
-def test_once_all_is_compiled_nothing_is_said_and_nobody_refused(service, capfd):
-    ready = service.client.get("/readyz").json()
-    assert (ready["status"], ready["preparing"]) == ("ready", None)
-    wait_until_ready(service.client)
-    assert capfd.readouterr() == ("", "")
-    warm_up()
-    assert preparing() is None
-    refuse_until_ready()
