@@ -483,10 +483,9 @@ def test_what_no_pose_sees_is_unreachable_until_the_rig_can_do_more(book, scanne
     desk = book.pass_desk(session)
     fixed = RigSetup(linear_reach(), OPTICS)
     desk.describe_rig(fixed)
-    foretold = desk.foretell()  # whoever only looks changes nothing
+    assert desk.foretell().lost_regions  # whoever only looks changes nothing
     assert not any(region.status is RegionStatus.UNREACHABLE for region in session.results().regions)
     plan = desk.plan()
-    assert plan is foretold
     lost = {region.region_id for region in session.results().regions if region.status is RegionStatus.UNREACHABLE}
     assert lost == set(plan.lost_regions) and lost
     shown = next(region for region in session.results().regions if region.region_id in lost)
