@@ -25,7 +25,7 @@ demo: $(VENV)/installed
 	$(BIN)/scanner demo --out $(OUT) $(ARGS)
 
 test: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 # Emulators that others wrote, in an environment of their own: OctoPrint (AGPL) is a tool of the tests, never imported.
 $(VENV)/emulators: $(VENV)/installed

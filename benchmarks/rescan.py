@@ -26,7 +26,6 @@ from benchmarks.rescan_truth import (
     sample_surface,
     sight_of,
     truth_of,
-    truth_of_lit,
 )
 from drivers.scanline import Pose, Scanline
 from scanner_service.analysis.intake import quantise
@@ -210,12 +209,12 @@ def compare(
     radius = float(np.sqrt(2.0)) * LINE_SPACING_MM + CONSTANT_MM
     caster, samples = Caster(case.part), sample_surface(case.part, closely_mm)
     sight = sight_of(caster, samples, optics, sweep)
-    closely = Looked(samples, sight, truth_of_lit(samples, sight, *asked))
+    closely = Looked(samples, sight, truth_of(samples, sight, *asked))
     found = agreements_of_lit(report.regions, closely, optics, sweep, radius)
     if with_shadows:
         samples = sample_surface(case.part, spacing_mm)
         sight = sight_of(caster, samples, optics, sweep)
-        looked = Looked(samples, sight, truth_of(caster, samples, sight, *asked))
+        looked = Looked(samples, sight, truth_of(samples, sight, *asked, caster=caster))
         found |= agreements_of_shadows(report.regions, case.part, looked, optics, sweep, radius)
     found[ISOLATED] = isolated_returns(snapshot, report, specks(case, scanner, sweep, 1), radius)
     about = {

@@ -250,7 +250,6 @@ def _camera_grazes(points_mm: Floats, lit: Bools, towards: Floats) -> Bools:
 
 
 def truth_of(
-    caster: Caster,
     samples: Samples,
     sight: Sight,
     optics: Optics,
@@ -258,22 +257,12 @@ def truth_of(
     density_per_mm2: float,
     constant_mm: float = 0.1,
     is_noisy: Callable[[Floats], Bools] | None = None,
+    caster: Caster | None = None,
 ) -> dict[str, Bools]:
-    """Of each reason, which samples (n,) it is true of; at most one holds, but for `noisy`."""
-    of_lit = truth_of_lit(samples, sight, optics, sweep, density_per_mm2, constant_mm, is_noisy)
-    return of_lit | {"shadow": _shadow(caster, samples, sight, optics, sweep)}
+    """Of each reason, which samples (n,) it is true of; at most one holds, but for `noisy`.
 
-
-def truth_of_lit(
-    samples: Samples,
-    sight: Sight,
-    optics: Optics,
-    sweep: Sweep,
-    density_per_mm2: float,
-    constant_mm: float = 0.1,
-    is_noisy: Callable[[Floats], Bools] | None = None,
-) -> dict[str, Bools]:
-    """The same of every reason but `shadow`, which takes a hundred times as long."""
+    Without a `caster` that of `shadow` is left out, which takes a hundred times as long as all others.
+    """
     visible = sight.visible
     after = np.clip(np.searchsorted(sweep.stations_mm, sight.station_mm), 1, len(sweep.stations_mm) - 1)
     gap = sweep.stations_mm[after] - sweep.stations_mm[after - 1]
@@ -285,13 +274,14 @@ def truth_of_lit(
     beyond = sight.stretch > np.sqrt(2.0) + constant_mm / sweep.line_spacing_mm
     steep = visible & ~lost & (beyond | (is_thin & (np.cos(sight.incidence_rad) < _GRAZING)))
     noisy = visible & is_noisy(samples.points_mm) if is_noisy is not None else np.zeros(len(samples), dtype=bool)
-    return {
+    truth = {
         "steep": steep,
         "sparse": visible & ~lost & ~steep & is_thin,
         "lost_lines": lost,
         "out_of_range": sight.lit & sight.camera & sight.in_fan & ~sight.in_range,
         "noisy": noisy,
     }
+    return truth if caster is None else truth | {"shadow": _shadow(caster, samples, sight, optics, sweep)}
 
 
 def _shadow(caster: Caster, samples: Samples, sight: Sight, optics: Optics, sweep: Sweep) -> Bools:

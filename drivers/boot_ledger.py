@@ -204,7 +204,7 @@ class BootLedger:
             _nonzero(self._damage),
             self._bytes_skipped,
             _nonzero(self._no_return),
-            {key: told for key, told in passes.items() if told != PassTally()},
+            passes={key: told for key, told in passes.items() if told != PassTally()},
         )
 
     def _account(self, pass_index: int) -> _PassAccount:

@@ -7,6 +7,7 @@ import contextlib
 import errno
 import fcntl
 import grp
+import logging
 import os
 import select
 import stat
@@ -27,6 +28,7 @@ from drivers.errors import (
     PortRateRefused,
 )
 
+_LOG = logging.getLogger(__name__)
 _READ_BYTES = 65_536
 _GONE = {errno.ENOENT, errno.ENXIO, errno.ENODEV, errno.EIO}
 _TIOCGICOUNT = 0x545D  # Linux: what the adapter counted since it was plugged in
@@ -81,9 +83,10 @@ class Port:
                 attributes = termios.tcgetattr(self._fd)
                 attributes[2] &= ~termios.HUPCL
                 termios.tcsetattr(self._fd, termios.TCSANOW, attributes)
-        # Where the adapter has no such switch it stays as it is: a matter of latency, not of right or wrong.
-        with contextlib.suppress(ValueError, OSError, NotImplementedError):
+        try:
             self._serial.set_low_latency_mode(True)
+        except (ValueError, OSError, NotImplementedError) as error:  # a matter of latency, not of right or wrong
+            _LOG.info("%s has no switch for low latency, its adapter may hold bytes back for a while: %s", path, error)
 
     def read(self, timeout_s: float) -> bytes:
         """Return what has arrived, after at most `timeout_s`; empty when nothing has.

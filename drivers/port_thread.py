@@ -8,6 +8,8 @@ from drivers.errors import PortError, PortStalled
 from drivers.port import Port
 
 _READ_S = 0.02
+_LATE_S = 0.1
+"""Bytes that waited longer than this, beyond the time for which a reading waits, waited for this computer."""
 _REOPEN_S = 0.1
 _STALL_S = 1.0
 
@@ -16,13 +18,17 @@ class PortThread(ABC):
     """A port over all its pullings-out, from `_begin` to `close`.
 
     `changed` guards what the methods below touch, which are called with it held unless they say otherwise. `failure` is
-    what ended the thread.
+    what ended the thread. `late_reads` counts readings that came so late that a device may have dropped what it could
+    not get rid of, and `largest_pause_s` is the longest time from one reading to the next.
     """
 
     def __init__(self, changed: threading.Condition, clock: Callable[[], float]) -> None:
         self._changed = changed
         self._clock = clock
         self.failure: Exception | None = None
+        self.late_reads = 0
+        self.largest_pause_s = 0.0
+        self._read_s = clock()  # when the latest reading ended
         self._stalled_s: float | None = None
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -53,7 +59,8 @@ class PortThread(ABC):
     def _begin(self, port: Port, name: str) -> None:
         """Tell that the link is there, and start the thread."""
         with self._changed:
-            self._opened(self._clock())
+            self._read_s = self._clock()
+            self._opened(self._read_s)
         self._thread = threading.Thread(target=self._run, args=(port,), name=name, daemon=True)
         self._thread.start()
 
@@ -70,7 +77,7 @@ class PortThread(ABC):
                     if port is None:
                         port = self._reopen()
                         continue
-                    self._talk(port, port.read(_READ_S))
+                    self._talk(port, self._read(port))
                 except PortError as error:
                     if port is not None:
                         port.close()
@@ -84,6 +91,16 @@ class PortThread(ABC):
         finally:
             if port is not None:
                 port.close()
+
+    def _read(self, port: Port) -> bytes:
+        """What has come; how long it waited beyond the time for which a reading waits is kept."""
+        data = port.read(_READ_S)
+        now_s = self._clock()
+        pause_s, self._read_s = now_s - self._read_s, now_s
+        if data:  # where nothing waited nobody was late
+            self.largest_pause_s = max(self.largest_pause_s, pause_s)
+            self.late_reads += pause_s > _READ_S + _LATE_S
+        return data
 
     def _watch_stall(self, path: str, written: int, now_s: float) -> None:
         """Raise PortStalled when the port has taken nothing for a second."""
@@ -115,5 +132,6 @@ class PortThread(ABC):
                 self._changed.notify_all()
             return None
         with self._changed:
-            self._opened(self._clock())
+            self._read_s = self._clock()
+            self._opened(self._read_s)
         return port

@@ -86,8 +86,10 @@ class Tally:
     """A moment's accounts of one scanner; `a + b` joins the accounts of two boots, or of two scanners.
 
     `damage` counts damaged pieces of the stream by reason, `bytes_skipped` their bytes. `no_return` counts points of
-    stored lines that the device itself gave no distance for, by the reason it told. `passes` has the accounts of each
-    pass, by boot id and pass index; they add up to `chunks` and `lines`.
+    stored lines that the device itself gave no distance for, by the reason it told. `late_reads` counts how often bytes
+    had waited for more than a tenth of a second because this computer did not come to read them, and `largest_pause_s`
+    is the longest time between two readings, each of which waits for bytes for 0.02 s at most. `passes` has the
+    accounts of each pass, by boot id and pass index; they add up to `chunks` and `lines`.
     """
 
     chunks: ChunkTally = field(default_factory=ChunkTally)
@@ -98,6 +100,8 @@ class Tally:
     damage: dict[str, int] = field(default_factory=dict)
     bytes_skipped: int = 0
     no_return: dict[str, int] = field(default_factory=dict)
+    late_reads: int = 0
+    largest_pause_s: float = 0.0
     passes: Mapping[tuple[int, int], PassTally] = field(default_factory=dict)
 
     def __add__(self, other: "Tally") -> "Tally":
@@ -111,11 +115,13 @@ class Tally:
             _join(a.damage, b.damage),
             a.bytes_skipped + b.bytes_skipped,
             _join(a.no_return, b.no_return),
+            a.late_reads + b.late_reads,
+            max(a.largest_pause_s, b.largest_pause_s),
             {**a.passes, **{key: a.passes.get(key, PassTally()) + told for key, told in b.passes.items()}},
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the accounts as plain nested dicts of integers, ready for JSON."""
+        """Return the accounts as plain nested dicts of numbers, ready for JSON."""
         return {
             "chunks": _chunks_to_dict(self.chunks),
             "lines": _lines_to_dict(self.lines),
@@ -125,6 +131,8 @@ class Tally:
             "damage": dict(self.damage),
             "bytes_skipped": self.bytes_skipped,
             "no_return": dict(self.no_return),
+            "late_reads": self.late_reads,
+            "largest_pause_s": self.largest_pause_s,
         }
 
 

@@ -4,7 +4,9 @@ A command is imported when it is asked for: the libraries of all of them togethe
 """
 
 import importlib
+import inspect
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -56,7 +58,16 @@ class CommandsWhenAsked(TyperGroup):
             command = typer.main.get_group(found)
             command.name = cmd_name
         put_placeholders(command, cmd_name)
+        _say_whole(command)
         return command
+
+
+def _say_whole(command: Any) -> None:
+    """Have lists of commands say the first sentence of each, however long; click would cut it to one line."""
+    if command.help:
+        command.short_help = re.split(r"(?<=\.)\s", inspect.cleandoc(command.help), maxsplit=1)[0]
+    for each in getattr(command, "commands", {}).values():
+        _say_whole(each)
 
 
 app = typer.Typer(

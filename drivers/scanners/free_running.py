@@ -57,6 +57,7 @@ class FreeRunner:
         self._inbox = Inbox(queue_lines)
         self._host: Conversation | None = None
         self._link: Link | None = None
+        self._latest: Link | None = None  # also when it is closed: what it counted is asked for then
 
     def __enter__(self) -> Self:
         self.enter()
@@ -79,7 +80,7 @@ class FreeRunner:
             raise DriverError(f"{self._path} has been entered already; exit first")
         self._inbox = Inbox(self._queue_lines)
         self._host = host = self._converse(Listener(self._inbox.deliver, self._inbox.tell, secrets.randbits(32)))
-        self._link = link = Link(
+        self._link = self._latest = link = Link(
             self._path, host, self._changed, self._clock, lambda: Wire(host.baud_rate, host.dtr), self._lines
         )
         with self._changed:
@@ -156,7 +157,7 @@ class FreeRunner:
             if self._host is None:
                 return Tally()
             tally = self._host.tally()
-            return tally if self._link is None else self._link.with_overruns(tally)
+            return tally if self._latest is None else self._latest.with_reading(tally)
 
     def exit(self) -> None:
         """Stop, switch the laser off, close the port; never raises, and returns within about 2 s."""

@@ -124,9 +124,10 @@ class Link(PortThread):
         self._reopen_path = lasting_path(path)
         self._begin(port, f"scanner {path}")
 
-    def with_overruns(self, tally: Tally) -> Tally:
-        """The accounts, with the bytes that nobody read in time among the damage."""
-        return replace(tally, damage=tally.damage | {"uart_overrun": self.overruns}) if self.overruns else tally
+    def with_reading(self, tally: Tally) -> Tally:
+        """The accounts, with how late bytes were read, and those that nobody read in time among the damage."""
+        damage = tally.damage | {"uart_overrun": self.overruns} if self.overruns else tally.damage
+        return replace(tally, damage=damage, late_reads=self.late_reads, largest_pause_s=self.largest_pause_s)
 
     def _talk(self, port: Port, data: bytes) -> None:
         """Take what was read, set the port as the host wants it, send what is due."""

@@ -66,6 +66,7 @@ class NativeScanner:
         self._inbox = Inbox(queue_lines)
         self._host = NativeHost(self._inbox.deliver, self._inbox.tell)
         self._link: Link | None = None
+        self._latest: Link | None = None  # also when it is closed: what it counted is asked for then
 
     def __enter__(self) -> Self:
         self.enter()
@@ -88,7 +89,9 @@ class NativeScanner:
         if self._link is not None:
             raise DriverError(f"{self._path} has been entered already; exit first")
         self._host = host = NativeHost(self._inbox.deliver, self._inbox.tell)
-        self._link = link = Link(self._path, host, self._changed, self._clock, lambda: Wire(self._baud_rate))
+        self._link = self._latest = link = Link(
+            self._path, host, self._changed, self._clock, lambda: Wire(self._baud_rate)
+        )
         with self._changed:
             wait_patiently(
                 self._changed,
@@ -214,7 +217,7 @@ class NativeScanner:
         with self._changed:
             stream = self._host.stream
             tally = stream.tally() if stream is not None else Tally()
-            return tally if self._link is None else self._link.with_overruns(tally)
+            return tally if self._latest is None else self._latest.with_reading(tally)
 
     def exit(self) -> None:
         """Stop the pass, switch the laser off, close the port; never raises, and returns within about 2 s."""

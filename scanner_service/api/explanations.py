@@ -111,6 +111,13 @@ EXPLANATIONS = {
     "session-not-live": Explanation(
         "The session is closed, or was closed meanwhile.", "Ask for it again: it is reopened from its lines.", _WRONG
     ),
+    "kernels-compiling": Explanation(
+        "The service was started a moment ago and still compiles what it computes with, once after an installation or "
+        "an update; no session can be opened before.",
+        "Send the request again after the seconds in `Retry-After`; `GET /readyz` says what is compiled and how far it "
+        "is.",
+        f"{API}#a-scan-from-the-shell",
+    ),
     "budget-spent": Explanation(
         "Stored lines take all of the disk that the service was allowed, and no session may be deleted by itself.",
         "Delete sessions, or start the service with a larger `--disk-budget-gb`.",
@@ -131,6 +138,12 @@ EXPLANATIONS = {
     ),
     "pass-unknown": Explanation(
         "There is no pass or order of that number.", "List the recommended passes, or the orders, again.", _DRIVE
+    ),
+    "part-not-turned": Explanation(
+        "The rig reaches this pass only when the part is turned, and the request does not say that it is. Nothing "
+        "moved, and the order waits on.",
+        'Turn the part as the message says, then carry the same order out with `{"part_is_turned": true}`.',
+        _DRIVE,
     ),
     "plan-overtaken": Explanation(
         "The plan was made for another map, requirement or rig, or for other regions: its numbers mean other passes.",

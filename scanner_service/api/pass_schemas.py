@@ -4,7 +4,8 @@ import math
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
+from pydantic.config import JsonDict
 
 from drivers.rig_limits import AxisKind, RigLimits
 from drivers.scanline import SensorGeometry
@@ -18,6 +19,21 @@ from scanner_service.sessions.closed_loop import LoopLimits
 from scanner_service.sessions.rig_setups import RigSetup, optics_stated
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+RIG_OF_A_RECORDING: JsonDict = {
+    "axis": "free_pose",
+    "scanner": {
+        "laser_mm": [0, 0, 150],
+        "camera_mm": [0, 76, 150],
+        "range_mm": [-30, 30],
+        "field_of_view_mm": 50,
+        "points_per_line": 400,
+    },
+    "reach_low_mm": [-100, -100, -20],
+    "reach_high_mm": [100, 100, 100],
+    "max_tilt_deg": 60,
+    "line_rate_hz": 50,
+}
+"""A body that states a scanner which is held in any pose within a box: what a recorded scan cannot tell of itself."""
 
 
 class ScannerIn(Strict):
@@ -37,6 +53,8 @@ class RigIn(Strict):
 
     `driven_by_client`: a client carries out what is accepted, by itself, so that the closed loop may run.
     """
+
+    model_config = ConfigDict(json_schema_extra={"examples": [RIG_OF_A_RECORDING]})
 
     axis: Literal["linear", "free_pose"]
     scanner: ScannerIn

@@ -143,7 +143,7 @@ async def refuse_websocket(websocket: WebSocket, response: Response) -> None:
 
 def _from_table(problem: Problem) -> Callable[[HTTPConnection, Exception], Response]:
     def respond(connection: HTTPConnection, error: Exception) -> Response:
-        if problem.status >= 500:
+        if problem.status >= 500 and "Retry-After" not in problem.headers:  # which is said of what passes by itself
             _log.error("%s: %s: %s", connection.scope.get("path"), type(error).__name__, error)
         fields = getattr(error, "fields", ())  # what the client named them by, so that a form can say it beside them
         return problem_response(problem, str(error) or problem.title, {"fields": list(fields)} if fields else None)

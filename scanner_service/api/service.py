@@ -17,7 +17,7 @@ from scanner_service.sessions.errors import SessionError
 from scanner_service.sessions.export_desk import ExportDesk
 from scanner_service.sessions.file_shelf import FileShelf
 from scanner_service.sessions.kernel_caches import mark_used
-from scanner_service.sessions.readiness import kernels_are_ready, warm_up
+from scanner_service.sessions.readiness import Preparing, kernels_are_ready, preparing, refuse_until_ready, warm_up
 from scanner_service.sessions.retention import Retention
 from scanner_service.storage.errors import RecordError, RecordUnusable
 from scanner_service.storage.reader import RecordReader
@@ -46,6 +46,11 @@ class Service:
         """True once no scan would wait for a compiler."""
         return kernels_are_ready()
 
+    @property
+    def preparing(self) -> Preparing | None:
+        """What is being compiled just now."""
+        return preparing()
+
     @classmethod
     def open(
         cls,
@@ -68,7 +73,9 @@ class Service:
             raise RecordUnusable(f"{data_dir} cannot be the folder of the data: {error.strerror}") from error
         record = Record.open(record_at or data_dir / "record.sqlite", limits=limits)
         try:
-            book = SessionBook(record, retention, meshes=replay_dir, rigs=data_dir / "rigs")
+            book = SessionBook(
+                record, retention, meshes=replay_dir, rigs=data_dir / "rigs", check_ready=refuse_until_ready
+            )
             access = Access.open(data_dir, time.monotonic, secrets.token_bytes)
             exports = ExportDesk(
                 data_dir / "exports",

@@ -10,7 +10,9 @@ import typer
 import scanner_service
 from scanner_service.commands.terminal import fail
 
-bench_app = typer.Typer(help="Measure how fast the service is, beside the tools that people use today.")
+bench_app = typer.Typer(
+    rich_markup_mode=None, help="Measure how fast the service is, beside the tools that people use today."
+)
 
 
 @bench_app.command("live-map")

@@ -19,7 +19,7 @@ from scanner_service.api.keys import read_local_key
 from scanner_service.api.login import login_url
 from scanner_service.api.server import ServerThread
 from scanner_service.api.service import Service
-from scanner_service.commands.demo_loop import watch_loop
+from scanner_service.commands.demo_loop import demo_name, watch_loop
 from scanner_service.commands.terminal import (
     check_folder,
     console,
@@ -31,6 +31,7 @@ from scanner_service.commands.terminal import (
     show_json,
     tell_regions,
 )
+from scanner_service.commands.until_ready import wait_until_ready
 from scanner_service.sessions.outputs import OUTPUT_FILES
 
 DEMO_PARTS = ("demo", "plate", "step", "sphere")
@@ -38,7 +39,6 @@ LINE_SPACING_MM = 0.15
 LINE_RATE_HZ = 50.0
 BAUD_RATE = 3_000_000
 _POLL_S = 0.2
-_COMPILING_S = 600.0
 
 
 def demo_command(
@@ -66,11 +66,11 @@ def demo_command(
         errors.print(f"        (the address works once; {'it serves until Ctrl-C' if keep else 'gone after the scan'})")
         if browse:
             webbrowser.open(viewer)
-        wait_until_ready(listening.url)
         key = read_local_key(Path(folder))
         client = stack.enter_context(
             httpx.Client(base_url=listening.url, headers={"Authorization": f"Bearer {key}"}, timeout=120.0)
         )
+        wait_until_ready(client)
         if loop:
             session_id = watch_loop(client, part, seed)
         else:
@@ -95,7 +95,7 @@ def scan(client: httpx.Client, part: str, simulator: dict[str, Any]) -> str:
     """Run one live session to its end, showing its progress; the session's id."""
     first_mm, last_mm = simulator["travel_mm"]
     request = {
-        "name": f"demo: {part}",
+        "name": demo_name("demo", part),
         "source": {
             "kind": "device",
             "port": simulator["port"],
@@ -104,6 +104,7 @@ def scan(client: httpx.Client, part: str, simulator: dict[str, Any]) -> str:
             "start_mm": first_mm,
             "end_mm": last_mm,
             "line_rate_hz": LINE_RATE_HZ,
+            "rearm": True,  # a simulated laser hurts nobody, and a busy machine may keep the device waiting
         },
     }
     session_id = str(_checked(client.post("/api/v1/sessions", json=request)).json()["id"])
@@ -115,8 +116,11 @@ def scan(client: httpx.Client, part: str, simulator: dict[str, Any]) -> str:
             if status["state"] == "failed":
                 fail(f"the scan failed: {status['message']}")
             if status["state"] == "stopped":
-                return session_id
+                break
             time.sleep(_POLL_S)
+    if status["message"]:
+        errors.print(f"note: {status['message']}", highlight=False, soft_wrap=True)
+    return session_id
 
 
 def tell(regions: list[dict[str, Any]], summary: dict[str, Any], out: Path) -> None:
@@ -133,27 +137,6 @@ def tell(regions: list[dict[str, Any]], summary: dict[str, Any], out: Path) -> N
     )
     console.print(loss_sentence(summary["losses"]), highlight=False, soft_wrap=True)
     console.print(f"Written to {out}: {', '.join(OUTPUT_FILES)}", highlight=False, soft_wrap=True)
-
-
-def wait_until_ready(url: str) -> None:
-    """Wait for the kernels; they are compiled once, at the first start on a machine."""
-    begun_s = time.monotonic()
-    said = "compiling kernels (only the first time) …"
-    if not errors.is_terminal:
-        errors.print(said)
-    with errors.status(said):
-        while not _is_ready(url):
-            if time.monotonic() - begun_s > _COMPILING_S:
-                fail("the service did not become ready in ten minutes: run it again, what was compiled is kept")
-            time.sleep(_POLL_S)
-
-
-def _is_ready(url: str) -> bool:
-    """Whether the service can scan; one that is too busy compiling to answer cannot yet."""
-    try:
-        return httpx.get(f"{url}/readyz").status_code == httpx.codes.OK
-    except httpx.TimeoutException:
-        return False
 
 
 @contextlib.contextmanager

@@ -18,6 +18,11 @@ COVERAGE_SHARE = 0.97
 _POLL_S = 0.1
 
 
+def demo_name(what: str, part: str) -> str:
+    """What a session of the demo is called: by its part where that is not the demo's own."""
+    return what if part == "demo" else f"{what}: {part}"
+
+
 def watch_loop(client: httpx.Client, part: str, seed: int) -> str:
     """Scan the part coarsely from above, then let the loop run to its end, telling of each pass; the session's id."""
     try:
@@ -27,7 +32,7 @@ def watch_loop(client: httpx.Client, part: str, seed: int) -> str:
         fail(f"the simulated arm needs {error.name}: install scanner-service[simulation]")
     subject = PARTS[part]()
     asked = {
-        "name": f"demo loop: {part}",
+        "name": demo_name("demo loop", part),
         "source": {"kind": "push"},
         "settings": {"density_per_mm2": DENSITY_PER_MM2},
     }

@@ -10,10 +10,13 @@ from rich.table import Table
 
 from scanner_service.commands.serve import DEFAULT_DATA, Data
 from scanner_service.commands.sessions import named, running_service
-from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json
+from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json, waiting_for
 
 Serving = dict[str, Sequence[str | int | float | bool | None]]
 _POLL_S = 0.3
+_PLANNED_S = 900.0
+"""A plan takes a second or two; on a computer that is busy with much else, minutes."""
+_PLANNING = "planning passes …"
 _OVER = ("done", "failed", "cancelled")
 
 
@@ -57,7 +60,8 @@ def rescan_command(
             elif cancel is not None:
                 result = _ask(client.delete(f"{where}/pass-orders/{cancel}"))
             else:
-                result = _ask(client.get(f"{where}/recommended-passes", params=serving))
+                with waiting_for(_PLANNING):
+                    result = _ask(client.get(f"{where}/recommended-passes", params=serving, timeout=_PLANNED_S))
         if as_json:
             show_json(result)
         elif auto:
@@ -72,28 +76,36 @@ def rescan_command(
 def _loop(client: httpx.Client, where: str, limits: dict[str, Any], quiet: bool) -> dict[str, Any]:
     """Start the closed loop and follow it to its end."""
     before = len(_ask(client.get(f"{where}/pass-orders"))["orders"])
-    _ask(client.post(f"{where}/rescan", json=limits))
     told = before
-    while True:
-        loop = _ask(client.get(f"{where}/rescan"))["loop"]
-        orders = _ask(client.get(f"{where}/pass-orders"))["orders"]
-        while told < len(orders) and orders[told]["status"] in _OVER:
-            if not quiet:
-                errors.print(f"order {orders[told]['order']}: {_said(orders[told])}", highlight=False, soft_wrap=True)
-            told += 1
-        if not loop["running"]:
-            return {"loop": loop, "orders": orders[before:]}
-        time.sleep(_POLL_S)
+    with waiting_for(_PLANNING) as say:
+        _ask(client.post(f"{where}/rescan", json=limits, timeout=_PLANNED_S))
+        while True:
+            loop = _ask(client.get(f"{where}/rescan"))["loop"]
+            orders = _ask(client.get(f"{where}/pass-orders"))["orders"]
+            while told < len(orders) and orders[told]["status"] in _OVER:
+                if not quiet:
+                    said = f"order {orders[told]['order']}: {_said(orders[told])}"
+                    errors.print(said, highlight=False, soft_wrap=True)
+                told += 1
+            if not loop["running"]:
+                return {"loop": loop, "orders": orders[before:]}
+            under_way = next((order for order in orders if order["status"] == "running"), None)
+            say(_PLANNING if under_way is None else f"order {under_way['order']} is carried out …")
+            time.sleep(_POLL_S)
 
 
 def _one(client: httpx.Client, where: str, number: int, plan: str, turned: bool, serving: Serving) -> dict[str, Any]:
     """Accept a pass, carry it out and wait for its end; a hand is guided meanwhile. One refused is cancelled."""
-    order = _ask(client.post(f"{where}/recommended-passes/{number}/accept", params=serving, json={"plan": plan}))
+    accept = f"{where}/recommended-passes/{number}/accept"
+    order = _ask(client.post(accept, params=serving, json={"plan": plan}, timeout=_PLANNED_S))
     mine = f"{where}/pass-orders/{order['order']}"
     errors.print(f"order {order['order']}: {_said(order)}", highlight=False, soft_wrap=True)
-    if turned and order["pass"]["turn_part"] is None:
+    turn = order["pass"]["turn_part"]
+    if turned != (turn is not None):  # nothing moved yet, and the same command can be given again
         client.delete(mine)
-        fail(f"pass {number} of plan {plan} asks for no turn of the part: leave out --turned")
+        if turn is None:
+            fail(f"pass {number} of plan {plan} asks for no turn of the part: leave out --turned")
+        fail(f"first {turn}; then give the same command with --turned (nothing moved, order {order['order']} is gone)")
     _ask(client.post(f"{mine}/carry-out", json={"part_is_turned": turned}))
     by_hand = _ask(client.get(where))["source"]["kind"] == "push"
     said = ""

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from scanner_service.commands.replay import play, tell
-from scanner_service.commands.terminal import check_folder, plain_errors, show_json
+from scanner_service.commands.terminal import check_folder, errors, plain_errors, show_json
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.outputs import write_outputs
@@ -50,6 +50,9 @@ def scan_command(
                 rig.name, spec, SessionSettings(target=Requirement(density_per_mm2=density)), (0.0, 0.0, 0.0), source
             )
             play(live, quiet=as_json)
+            said = live.status().message
+            if said:
+                errors.print(f"note: {said}", highlight=False, soft_wrap=True)
             summary = write_outputs(out, live)
             results = live.results()
         if as_json:

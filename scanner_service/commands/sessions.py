@@ -15,6 +15,7 @@ from rich.table import Table
 from scanner_service.api.keys import read_local_key
 from scanner_service.commands.serve import DEFAULT_DATA, Data
 from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json, tell_regions
+from scanner_service.commands.until_ready import wait_until_ready
 from scanner_service.sessions.stored import named_session
 
 _ASKED = {
@@ -40,7 +41,7 @@ _POLL_S = 0.1
 
 @contextmanager
 def running_service(data: Path, url: str) -> Iterator[httpx.Client]:
-    """A client of the running service, with this machine's own key."""
+    """A client of the running service, with this machine's own key; one that was just started is waited for."""
     key = read_local_key(data)
     if key is None:
         fail(f"there is no key in {data}: start `scanner serve` first, or name its folder with --data")
@@ -49,6 +50,7 @@ def running_service(data: Path, url: str) -> Iterator[httpx.Client]:
             client.get("/healthz")
         except httpx.HTTPError as error:
             fail(f"no service answers at {url} ({error}): start it with `scanner serve`, or say --url")
+        wait_until_ready(client)
         yield client
 
 

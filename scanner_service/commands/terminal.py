@@ -7,7 +7,7 @@ import os
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
@@ -47,6 +47,8 @@ errors = paper(sys.stderr, os.environ)
 _MADE: ContextVar[tuple[Path, ...]] = ContextVar("folders that the command has made", default=())
 _UNWANTED = {"outside_pass", "between_stops", "before_start"}
 """Reasons of lines that a scanner made while its stage turned or went to the next stop: no loss."""
+_NOT_READ = {"host_overflow", "overflow", "queue_full"}
+"""Reasons of lines that came, and that this computer had no time for."""
 
 EXPECTED = (
     httpx.HTTPError,
@@ -191,6 +193,27 @@ class WorkProgress:
         self._bar.update(self._task, completed=share, description=f"{self._title}: {what}")
 
 
+@contextlib.contextmanager
+def waiting_for(said: str) -> Iterator[Callable[[str], None]]:
+    """Say what is being waited for, and what next, on standard error: on a terminal as long as it lasts.
+
+    On something that is no terminal each is a line of its own, once.
+    """
+    told = said
+
+    def say(now: str) -> None:
+        nonlocal told
+        if now != told and not errors.is_terminal:
+            errors.print(now, highlight=False, soft_wrap=True)
+        told = now
+        shown.update(now)
+
+    if not errors.is_terminal:
+        errors.print(said, highlight=False, soft_wrap=True)
+    with errors.status(said) as shown:
+        yield say
+
+
 def lost_lines(losses: Mapping[str, Any]) -> int:
     """Lines of all passes that were sent and wanted, and are not stored: by the device, on the wire, or here."""
     return sum(_lost(losses["passes"]).values())
@@ -215,9 +238,22 @@ def loss_sentence(losses: Mapping[str, Any]) -> str:
     said = [f"of {sent:,} scanlines {partial:,} are partial", f"{lost.total():,} lost{_by_reason(lost)}"]
     if chunks.total():
         said.append(f"of {sent_chunks:,} chunks {chunks.total():,} were lost{_by_reason(chunks)}")
-    helps = "device_dropped" in lost or "device_dropped" in chunks
-    advice = " The scanner measured more than its wire carries: a slower pass or a lower line rate helps."
-    return f"Losses: {', '.join(said)}.{advice if helps else ''}"
+    return " ".join((f"Losses: {', '.join(said)}.", *_advice({*lost, *chunks}, losses.get("device") or {})))
+
+
+def _advice(reasons: set[str], device: Mapping[str, Any]) -> Iterator[str]:
+    """What helps, by what was counted: a scanner drops what its wire does not carry, and what nobody reads."""
+    late, dropped = device.get("late_reads", 0), "device_dropped" in reasons
+    carried_hz = device.get("wire_line_rate_hz")
+    wire_has_time = carried_hz is not None and device["line_rate_hz"] <= carried_hz
+    if dropped and not wire_has_time:
+        yield "The scanner measured more than its wire carries: a slower pass or a lower line rate helps."
+    elif dropped and not late:
+        yield "The scanner dropped lines that its wire has time for: a slower pass or a lower line rate helps."
+    if reasons & _NOT_READ or "uart_overrun" in device.get("damage", {}) or (dropped and late):
+        often = "once" if late == 1 else f"{late:,} times"
+        when = f" (late {often}, by up to {device['largest_pause_s']:.1f} s)" if late else ""
+        yield f"This computer was too busy to read in time what came{when}: close other programs, or scan more slowly."
 
 
 def _lost(passes: Iterable[Mapping[str, Any]]) -> "Counter[str]":

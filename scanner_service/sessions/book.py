@@ -4,7 +4,6 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from scanner_service.sessions.calibration import calibration_after, calibration_
 from scanner_service.sessions.errors import BudgetSpent, SessionBusy, SessionError
 from scanner_service.sessions.pass_desk import PassDesk
 from scanner_service.sessions.references import Nominal, nominal_of
+from scanner_service.sessions.reopening import Opening
 from scanner_service.sessions.retention import OVER, Kept, Retention, choose
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.settings import SessionSettings
@@ -32,20 +32,6 @@ _HOLDING = ("created", "scanning", "paused")
 """States in which a session has its ports open."""
 
 
-@dataclass(slots=True)
-class Opening:
-    """A session whose map is being built from the record: lines taken of those there are."""
-
-    of: int
-    lines: int = 0
-    done: threading.Event = field(default_factory=threading.Event)
-
-    @property
-    def share(self) -> float:
-        """How much is done, 0 to 1."""
-        return min(1.0, self.lines / self.of) if self.of else 1.0
-
-
 class SessionBook:
     """All sessions of one record; those that somebody looks at are held open."""
 
@@ -56,8 +42,10 @@ class SessionBook:
         clock: Callable[[], datetime] = utc_now,
         meshes: Path | None = None,
         rigs: Path | None = None,
+        check_ready: Callable[[], None] = lambda: None,
     ) -> None:
         self.record = record
+        self._check_ready = check_ready  # raises what whoever wants a session opened is to be told instead
         self._meshes = meshes  # the folder in which reference meshes lie
         self._rigs = rigs  # the folder in which rig files lie
         self.retention = retention or Retention()
@@ -67,6 +55,7 @@ class SessionBook:
         self._opening: dict[str, Opening] = {}
         self._creating: set[str] = set()
         self._deleting: set[str] = set()
+        self._leaving: dict[str, threading.Event] = {}  # sessions that are just being closed to make room
         self._places = 0  # kept for sessions that are being made
         self._is_closed = False
         self._failures: dict[str, str] = {}
@@ -97,6 +86,7 @@ class SessionBook:
         Raises
         ------
         SessionBusy : too many sessions are open, or the same request is being carried out.
+        KernelsCompiling : it is too early to open one.
         BudgetSpent : the disk budget is used up.
         SourceUnusable, DriverError : the source cannot be opened; no session was made.
         CreationKeyReused : the key came before, with another request.
@@ -148,6 +138,7 @@ class SessionBook:
         key: CreationKey | None,
         reference: ReferenceSurface | None,
     ) -> LiveSession:
+        self._check_ready()
         self.make_room_on_disk()
         with self._place_kept():
             opened = self._open(spec) if source is None else source
@@ -175,9 +166,10 @@ class SessionBook:
     def _place_kept(self) -> Iterator[None]:
         """Keep a place among the open sessions for one that is being made; nobody waits for its disk or its device."""
         with self._lock:
-            self._make_room()
+            leaving = self._make_room()
             self._places += 1
         try:
+            self._see_off(leaving)
             yield
         finally:
             with self._lock:
@@ -216,6 +208,7 @@ class SessionBook:
         ------
         SessionUnknown : there is none.
         SessionBusy : too many sessions are open.
+        KernelsCompiling : it is too early to open one.
         """
         while True:
             live = self._live.get(session_id)
@@ -227,14 +220,16 @@ class SessionBook:
                     return live
                 if session_id in self._deleting:
                     raise SessionUnknown(f"session {session_id} is being deleted")
-                opening = self._opening.get(session_id)
-                if opening is None:
+                busy = self._busy_with(session_id)
+                if busy is None:
                     row = self.record.get_session(session_id)
-                    self._make_room()
+                    self._check_ready()
+                    leaving = self._make_room()
                     mine = self._opening[session_id] = Opening(self.record.count(session_id).lines)
                     break
-            opening.done.wait()
+            busy.wait()
         try:
+            self._see_off(leaving)
             return self._reopen(row, mine, on_progress)
         finally:
             with self._lock:
@@ -306,15 +301,15 @@ class SessionBook:
         """Stop and delete a session with everything stored of it; raises SessionUnknown."""
         while True:
             with self._lock:
-                opening = self._opening.get(session_id)
-                if opening is None:
+                busy = self._busy_with(session_id)
+                if busy is None:
                     if session_id in self._deleting:
                         raise SessionUnknown(f"session {session_id} is being deleted")
                     self._deleting.add(session_id)
                     live = self._live.pop(session_id, None)
                     self._desks.pop(session_id, None)
                     break
-            opening.done.wait()
+            busy.wait()
         try:
             if live is not None:
                 live.close()
@@ -356,21 +351,42 @@ class SessionBook:
         with self._lock:
             self._is_closed = True
             closing, self._live = self._live, {}
+            leaving = list(self._leaving.values())
         with contextlib.ExitStack() as stack:  # one that cannot be closed keeps none of the others open
+            for event in leaving:
+                stack.callback(event.wait)
             for live in closing.values():
                 stack.callback(live.close)
 
-    def _make_room(self) -> None:
-        """Close the session that was opened first among those that neither scan nor stand between two passes."""
+    def _make_room(self) -> LiveSession | None:
+        """Let go of the session that was opened first among those that neither scan nor stand between two passes.
+
+        The lock is held; whoever called closes it (`_see_off`) without. None where there is room.
+        """
         if len(self._live) + len(self._opening) + self._places < MAX_LIVE:
-            return
+            return None
         for session_id, session in self._live.items():
             if session.state in OVER and not self._is_at_work(session_id):
-                session.close()
                 del self._live[session_id]
                 self._desks.pop(session_id, None)
-                return
+                self._leaving[session_id] = threading.Event()
+                return session
         raise SessionBusy(f"{MAX_LIVE} sessions are scanning or waiting: stop one first")
+
+    def _see_off(self, session: LiveSession | None) -> None:
+        """Close a session that made room, for which nobody waits but who asks for that one."""
+        if session is None:
+            return
+        try:
+            session.close()
+        finally:
+            with self._lock:
+                self._leaving.pop(session.row.session_id).set()
+
+    def _busy_with(self, session_id: str) -> threading.Event | None:
+        """What whoever wants this session has to wait for: it is being opened, or closed. The lock is held."""
+        opening = self._opening.get(session_id)
+        return self._leaving.get(session_id) if opening is None else opening.done
 
     def _is_at_work(self, session_id: str) -> bool:
         """True for a session whose rescan loop or pass is under way."""

@@ -21,6 +21,7 @@ class Course:
         self.time = ScanClock(clock)
         self.turn = threading.RLock()
         self.message: str | None = None
+        self.remark: str | None = None  # what its last pass leaves to be said
         self._state = state
         self._is_held = False
         self._is_ending = False
@@ -32,6 +33,11 @@ class Course:
     def state(self) -> str:
         """One of `status.STATES`; `scanning` or `paused` until the last verdict is there."""
         return self._state
+
+    @property
+    def told(self) -> str | None:
+        """What there is to say of it."""
+        return self.message or self.remark
 
     @property
     def is_held(self) -> bool:
@@ -77,6 +83,7 @@ class Course:
         with self._change:
             before, said = self._state, self.message
             self._state = "scanning"
+            self.remark = None
             if before == "failed":
                 self.message = None
             self.time.start()

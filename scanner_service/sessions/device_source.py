@@ -29,6 +29,7 @@ from drivers.scanners.face import Happening
 from drivers.scanners.native import NativeScanner
 from drivers.tally import PassTally
 from scanner_service.analysis.passes import PassKey
+from scanner_service.sessions.lost_ends import LOST_END, lost_behind
 from scanner_service.sessions.source import Sink
 
 _LOG = logging.getLogger(__name__)
@@ -106,8 +107,9 @@ class DeviceSource:
         )
 
     def tally(self) -> dict[str, Any] | None:
-        """Chunks and lines: sent, stored, lost by reason."""
-        return self._scanner.tally().to_dict()
+        """Chunks and lines: sent, stored, lost by reason; the line rate that was ordered, and that the wire carries."""
+        told = {"line_rate_hz": self._request.line_rate_hz, "wire_line_rate_hz": self._scanner.most_lines_per_s}
+        return self._scanner.tally().to_dict() | told
 
     def pass_tallies(self) -> Mapping[PassKey, PassTally]:
         """See `OnAWire`."""
@@ -154,17 +156,31 @@ class DeviceSource:
                         return True
                     sink.note("held", {"reason": reason, "from_mm": self._next_mm})
                     return False
+                if reason == "reached_end":
+                    self._tell_lost_end(pass_index, sink)
                 return reason in ("reached_end", "stopped", "fault")
             case _:
                 tell_scanner_event(event, sink)
         return False
 
+    def _tell_lost_end(self, pass_index: int, sink: Sink) -> None:
+        """Say where lines are missing behind the last one that came."""
+        told = (tally for (_, index), tally in self._scanner.tally().passes.items() if index == pass_index)
+        lost = sum(sum(tally.lines.lost.values()) for tally in told)
+        found = lost_behind(self._next_mm, self._request.end_mm, self._step_mm, lost)
+        if found is not None:
+            sink.note(LOST_END, {"pass_index": pass_index, **found.to_dict()})
+
     def _passed(self, position_mm: float) -> None:
         """A line was read at a stage position."""
-        request = self._request
         self._position_mm = position_mm
         if math.isfinite(position_mm):
-            self._next_mm = position_mm + math.copysign(request.line_spacing_mm, request.end_mm - request.start_mm)
+            self._next_mm = position_mm + self._step_mm
+
+    @property
+    def _step_mm(self) -> float:
+        """From one line to the next, negative where the stage goes down."""
+        return math.copysign(self._request.line_spacing_mm, self._request.end_mm - self._request.start_mm)
 
     def _is_complete(self) -> bool:
         """True when the last line of the pass has been read: there is no rest to go on with."""

@@ -4,7 +4,9 @@ SessionError
 ├── SessionNotLive      the session is in the record, but not open
 ├── SessionBusy         the request does not fit the session's state
 ├── PassUnknown         no such recommended or accepted pass
+├── PartNotTurned       the pass asks for a turn of the part, and nobody said that it is turned
 ├── PlanOvertaken       the plan in which a pass was seen is not in force any more
+├── KernelsCompiling    no session can be opened before the kernels are compiled
 ├── BudgetSpent         the disk budget is used up, and no session may be deleted to make room
 ├── SourceUnusable      what the session should read from cannot be read
 ├── FileUnknown         no file of that name lies in the replay folder
@@ -32,8 +34,16 @@ class PassUnknown(SessionError):
     """There is no recommended or accepted pass of that number."""
 
 
+class PartNotTurned(SessionError):
+    """The pass asks for a turn of the part, and nobody said that it is turned; its order waits on."""
+
+
 class PlanOvertaken(SessionError):
     """The plan in which a pass was seen is not in force any more."""
+
+
+class KernelsCompiling(SessionError):
+    """No session can be opened before the kernels are compiled; the message says how far that is."""
 
 
 class BudgetSpent(SessionError):

@@ -10,6 +10,7 @@ from scanner_service.analysis.intake import StoredLine
 from scanner_service.sessions.course import Course
 from scanner_service.sessions.engine import Engine
 from scanner_service.sessions.errors import SessionError
+from scanner_service.sessions.lost_ends import LOST_END
 
 _LOG = logging.getLogger(__name__)
 
@@ -61,6 +62,8 @@ class Hearing:
                 )
             case "resumed":
                 self._course.go_on()
+            case kind if kind == LOST_END:
+                self._course.remark = str(details["message"])
 
     def ended(self, failure: str | None) -> None:
         """The source is used up."""

@@ -11,6 +11,7 @@ from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.results import Results, summarise
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.stored import StoredSession
+from scanner_service.sessions.withdrawals import end_of_scan_utc
 from scanner_service.storage.exports.density_png import density_png
 from scanner_service.storage.exports.points_ply import write_points_ply
 from scanner_service.storage.exports.results_json import write_json
@@ -20,24 +21,30 @@ from scanner_service.storage.rows import SessionRow
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What the files tell of, be the session held open or read from the record; `points_per_s` may be NaN."""
+    """What the files tell of, be the session held open or read from the record; `points_per_s` may be NaN.
+
+    `ended_utc` is None while the scan has not ended.
+    """
 
     row: SessionRow
     state: str
     results: Results
     losses: Mapping[str, Any]
     points_per_s: float
+    ended_utc: str | None
 
 
 def outcome_of(session: LiveSession, results: Results) -> Outcome:
     """Of a session that is held open."""
     status = session.status()
-    return Outcome(session.row, status.state, results, status.losses, status.points_per_s)
+    return Outcome(
+        session.row, status.state, results, status.losses, status.points_per_s, end_of_scan_utc(session.past_events())
+    )
 
 
 def stored_outcome(stored: StoredSession) -> Outcome:
     """Of a session that was read from the record, which does not tell how long it took."""
-    return Outcome(stored.row, stored.row.state, stored.results, stored.losses, float("nan"))
+    return Outcome(stored.row, stored.row.state, stored.results, stored.losses, float("nan"), stored.ended_utc)
 
 
 def summary_of(outcome: Outcome) -> dict[str, Any]:
@@ -56,11 +63,17 @@ def _density(path: Path, outcome: Outcome) -> None:
         outcome.results.snapshot,
         outcome.results.regions,
         session_name=outcome.row.name,
-        when=outcome.row.created_utc[:16].replace("T", " ") + " UTC",
+        when=_when(outcome),
         coverage=outcome.results.share,
         required_per_mm2=outcome.results.typical_required_per_mm2,
     )
     write_whole(path, picture)
+
+
+def _when(outcome: Outcome) -> str:
+    """When the scan ended, or what is known instead."""
+    said = "begun " if outcome.ended_utc is None else ""
+    return said + (outcome.ended_utc or outcome.row.created_utc)[:16].replace("T", " ") + " UTC"
 
 
 def _regions(path: Path, outcome: Outcome) -> None:

@@ -19,7 +19,7 @@ from scanner_service.rescan.passes.tried import Tried
 from scanner_service.rescan.reference import ReferenceSurface
 from scanner_service.rescan.region import RegionStatus
 from scanner_service.sessions.closed_loop import LoopLimits, LoopState, run
-from scanner_service.sessions.errors import SessionBusy, SessionError, SourceUnusable
+from scanner_service.sessions.errors import PartNotTurned, SessionBusy, SessionError, SourceUnusable
 from scanner_service.sessions.pass_orders import (
     ACCEPTED,
     CANCELLED,
@@ -53,6 +53,7 @@ class PassDesk:
         self._changes = 0  # of what plans are made from
         self._setup: RigSetup | None = None
         self._plan: Plan | None = None
+        self._marked: Plan | None = None  # what was told of regions is told by this one
         self._planned_for: tuple[object, ...] = ()  # what is served, and what is asked for
         self._planned_against: ReferenceSurface | None = None  # the nominal part
         self._orders = OrderBook()
@@ -84,6 +85,11 @@ class PassDesk:
         """
         with self._planning:
             return self._planned(serving or EVERYTHING)
+
+    def foretell(self, serving: Serving | None = None) -> Plan:
+        """The same for whoever only looks: no region is marked, nothing is written; raises as `plan`."""
+        with self._planning:
+            return self._current_plan(serving or EVERYTHING)[0]
 
     def accept(self, number: int, serving: Serving | None = None, seen: str | None = None) -> PassOrder:
         """Take an order for a pass of the plan in force.
@@ -122,7 +128,7 @@ class PassDesk:
         """Drive an accepted pass; pushed scanlines are waited for where a client or a hand moves the scanner.
 
         A refused order is cancelled with the reason, whoever gave it; accept it again when that is mended. One whose
-        devices do not set off has failed, with the reason.
+        devices do not set off has failed, with the reason. One for which only the operator's word is missing waits on.
 
         Parameters
         ----------
@@ -131,12 +137,13 @@ class PassDesk:
         Raises
         ------
         PassUnknown, SessionBusy : there is no such order, or the session or the order is in another state.
+        PartNotTurned : the pass asks for a turn of the part; the order is as it was.
         PlanningError : the rig cannot carry it out.
         SourceUnusable, DriverError : the pass could not be started.
         """
-        order = self._claimed(order_id)
+        order = self._claimed(order_id, part_is_turned)
         try:
-            before, setup = self._begun(order, part_is_turned)
+            before, setup = self._begun(order)
         except Exception as error:
             self._not_begun(order, error)
             raise
@@ -195,10 +202,9 @@ class PassDesk:
         latest = self._session.hearing.latest_lines()
         if not latest:
             raise SessionBusy("no scanline has come yet: switch the scanner on and move it over the part")
-        line, at_s = latest[-1]
-        speed = float("nan")
-        if len(latest) > 1 and at_s > latest[0][1]:
-            speed = float(np.linalg.norm(line.laser_mm - latest[0][0].laser_mm)) / (at_s - latest[0][1])
+        (first, since_s), (line, at_s) = latest[0], latest[-1]
+        way_mm = float(np.linalg.norm(line.laser_mm - first.laser_mm))
+        speed = way_mm / (at_s - since_s) if at_s > since_s else float("nan")
         laser = self._setup_now().optics.geometry.laser_mm
         return guide(order.planned, laser, line.laser_mm, line.plane_normal, speed)
 
@@ -221,8 +227,7 @@ class PassDesk:
     # -- inside -------------------------------------------------------------------------------------------------
 
     def _setup_now(self, results: Results | None = None) -> RigSetup:
-        with self._lock:
-            known = self._setup
+        known = self._setup
         if known is None:
             results = results or self._session.results() or self._session.fresh_results()
             found = setup_of(self._session, results.snapshot, self._rigs)
@@ -248,12 +253,13 @@ class PassDesk:
     def _planned(self, serving: Serving) -> Plan:
         """See `plan`; one thread at a time comes here."""
         plan, results = self._current_plan(serving)
-        if results is not None and serving == EVERYTHING:
+        if serving == EVERYTHING and self._marked is not plan:
+            self._marked = plan
             self._mark(results, plan)
         return plan
 
-    def _current_plan(self, serving: Serving) -> tuple[Plan, Results | None]:
-        """The plan for the map as it is, and the verdict it was made from where it was made just now.
+    def _current_plan(self, serving: Serving) -> tuple[Plan, Results]:
+        """The plan for the map as it is, and the verdict on it.
 
         It is made without the lock, so that whoever asks meanwhile of orders is answered; made again when what it was
         made from has changed meanwhile.
@@ -265,7 +271,7 @@ class PassDesk:
                 known, changes = self._plan, self._changes
                 is_same = self._planned_for == wanted and self._planned_against is nominal
                 if known is not None and known.version == results.report.version and is_same:
-                    return known, None
+                    return known, results
                 question = self._question(results, setup, serving)
             plan = question.answered()
             with self._lock:
@@ -273,13 +279,21 @@ class PassDesk:
                     self._plan, self._planned_for, self._planned_against = plan, wanted, nominal
                     return plan, results
 
-    def _claimed(self, order_id: int) -> PassOrder:
-        """The order, now being set off; raises SessionBusy, and cancels it when that is for another on its way."""
+    def _claimed(self, order_id: int, part_is_turned: bool) -> PassOrder:
+        """The order, now being set off; raises PartNotTurned and leaves it, or SessionBusy.
+
+        It is cancelled where that is for another on its way.
+        """
         with self._lock:
             order = self._orders.get(order_id)
             if order.status is not PassStatus.ACCEPTED or self._setting_off == order_id:
                 state = "being set off" if self._setting_off == order_id else order.status.value
                 raise SessionBusy(f"pass order {order_id} is {state}: accept a pass of a new plan")
+            turn = order.planned.turn
+            if turn is not None and not turn.is_none and not part_is_turned:
+                raise PartNotTurned(
+                    f'first {turn}; then carry pass order {order_id} out with {{"part_is_turned": true}}: it waits on'
+                )
             running = self._orders.running()
             other = self._setting_off if running is None else running.order_id
             if other is not None:
@@ -314,14 +328,8 @@ class PassDesk:
             self._task(-1)
             order.done.set()
 
-    def _begun(self, order: PassOrder, part_is_turned: bool) -> tuple[Results, RigSetup]:
+    def _begun(self, order: PassOrder) -> tuple[Results, RigSetup]:
         """Start the pass of an order; the verdict before it, and the rig that it goes with. Raises as `carry_out`."""
-        turn = order.planned.turn
-        if turn is not None and not turn.is_none and not part_is_turned:
-            raise SessionBusy(
-                f"first {turn}; then accept the pass again and carry it out, saying that the part is turned "
-                '(--turned, or "part_is_turned": true)'
-            )
         before = self._session.fresh_results()
         setup, planned = self._setup_now(before), order.planned
         setup.reach.check(planned.motion, planned.start_mm, planned.end_mm, planned.line_spacing_mm)

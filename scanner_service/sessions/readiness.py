@@ -1,23 +1,73 @@
-"""Whether scans can begin without waiting for a compiler: compiles everything once a process."""
+"""Whether scans can begin without waiting for a compiler: compiles all once a process, and says how far it is."""
 
 import gc
 import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from scanner_service.analysis.compiling import compile_kernels
 from scanner_service.rescan.cuts import compile_cuts
 from scanner_service.rescan.passes.compiling import compile_planner
 from scanner_service.rescan.requirement import Requirement
+from scanner_service.sessions.errors import KernelsCompiling
 from scanner_service.sessions.kernel_caches import mark_used, remove_unused
 from scanner_service.sessions.results import judge
 from scanner_service.storage.packing import compile_packing
+
+STEPS = ("the packing of lines", "the live map", "the verdict", "the planner of passes")
+"""What is compiled, in this order."""
 
 _LOCK = threading.Lock()
 _READY = threading.Event()
 
 
+@dataclass(frozen=True, slots=True)
+class Preparing:
+    """What is being compiled: step `step` of `of`, `seconds` after the beginning of all."""
+
+    what: str
+    step: int
+    of: int
+    seconds: float
+
+    def __str__(self) -> str:
+        return f"compiling {self.what}, step {self.step} of {self.of}, for {self.seconds:.0f} s now"
+
+
+@dataclass(slots=True)
+class _Course:
+    """How far the compiling is; written by the thread that compiles."""
+
+    step: int = 0  # of those that are counted from 1; 0 before the first
+    begun_s: float = 0.0
+
+
+_COURSE = _Course()
+
+
 def kernels_are_ready() -> bool:
     """True once every kernel is compiled in this process."""
     return _READY.is_set()
+
+
+def preparing(clock: Callable[[], float] = time.monotonic) -> Preparing | None:
+    """What is being compiled just now; None when nothing is."""
+    step, begun_s = _COURSE.step, _COURSE.begun_s
+    if _READY.is_set() or not step:
+        return None
+    return Preparing(STEPS[step - 1], step, len(STEPS), max(0.0, clock() - begun_s))
+
+
+def refuse_until_ready() -> None:
+    """Raise KernelsCompiling, which says how far that is, as long as kernels are compiled."""
+    if not _READY.is_set():
+        told = preparing()
+        how_far = f" ({told})" if told is not None else ""
+        raise KernelsCompiling(
+            f"the service is not ready yet: after an installation it compiles its kernels once, for a minute or "
+            f"two{how_far}; try again in a moment, GET /readyz says when"
+        )
 
 
 def warm_up() -> None:
@@ -27,13 +77,22 @@ def warm_up() -> None:
     holds up every thread, otherwise goes through some 300,000 objects of libraries, for a fifth of a second.
     """
     with _LOCK:
-        if not _READY.is_set():
+        if _READY.is_set():
+            return
+        _COURSE.step, _COURSE.begun_s = 1, time.monotonic()
+        try:
             mark_used()
             compile_packing()
+            _COURSE.step = 2
             snapshot = compile_kernels()
+            _COURSE.step = 3
             compile_cuts()
-            compile_planner(snapshot, judge(snapshot, Requirement()).report)
-            mark_used()  # it may not have been there before
-            remove_unused()
-            gc.freeze()
-            _READY.set()
+            report = judge(snapshot, Requirement()).report
+            _COURSE.step = 4
+            compile_planner(snapshot, report)
+        finally:
+            _COURSE.step = 0
+        mark_used()  # it may not have been there before
+        remove_unused()
+        gc.freeze()
+        _READY.set()

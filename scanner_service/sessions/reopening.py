@@ -1,8 +1,9 @@
 """A session's map, ledger and regions built again from its record, on behalf of whoever opens it; starts nothing."""
 
+import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from scanner_service.analysis.errors import AnalysisError
@@ -11,6 +12,20 @@ from scanner_service.sessions.engine import Engine, is_partial
 from scanner_service.sessions.left_regions import LeftRegions, last_left
 from scanner_service.sessions.withdrawals import ends_of_passes, withdrawn_passes
 from scanner_service.storage.record import Record
+
+
+@dataclass(slots=True)
+class Opening:
+    """A session whose map is being built from the record: lines taken of those there are."""
+
+    of: int
+    lines: int = 0
+    done: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def share(self) -> float:
+        """How much is done, 0 to 1."""
+        return min(1.0, self.lines / self.of) if self.of else 1.0
 
 
 @dataclass(frozen=True, slots=True)

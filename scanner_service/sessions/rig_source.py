@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from drivers.errors import DriverError
+from drivers.pass_accounts import PassReport
 from drivers.protocols.scanner_events import PassEnded
 from drivers.protocols.stage_events import PositionLost, StageDisconnected, StageReconnected
 from drivers.rig_description import RigDescription
@@ -20,6 +21,7 @@ from drivers.stages.face import DrivenStage
 from drivers.tally import PassTally
 from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.device_source import tell_scanner_event
+from scanner_service.sessions.lost_ends import LOST_END, unseen_behind
 from scanner_service.sessions.source import Sink
 
 _LOG = logging.getLogger(__name__)
@@ -129,10 +131,19 @@ class RigSource:
             for event in self._rig.events(0.1):
                 if isinstance(event, RigPassEnded):
                     sink.note("pass_ended", {"reason": event.reason, **event.report.to_dict()})
+                    if event.reason == "reached_end":
+                        self._tell_lost_end(event.report, sink)
                     if event.reason == "reached_end" and event.failure is None and self.is_driven:
                         self.rests_at_mm = self._order.end_mm
                     return event.failure
                 self._pass_on(event, sink)
+
+    def _tell_lost_end(self, report: PassReport, sink: Sink) -> None:
+        """Say where lines are missing behind the last one that came."""
+        step_mm = np.nanmax([self._order.line_spacing_mm, abs(report.median_step_mm)])
+        found = unseen_behind(self._position_mm, self._order.end_mm, float(step_mm))
+        if found is not None:
+            sink.note(LOST_END, found.to_dict())
 
     def _pass_on(self, event: RigEvent, sink: Sink) -> None:
         match event:

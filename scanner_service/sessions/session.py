@@ -342,7 +342,7 @@ class LiveSession:
                 self.engine.failure
                 or self._chronicle.trouble()
                 or self._analyst.failure
-                or self._course.message
+                or self._course.told
                 or (results.reference_refused if results else None)
             ),
             held=self._course.is_held,

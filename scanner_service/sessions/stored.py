@@ -20,7 +20,7 @@ from scanner_service.sessions.left_regions import last_left
 from scanner_service.sessions.references import nominal_of
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.settings import SessionSettings
-from scanner_service.sessions.withdrawals import ends_of_passes, withdrawn_passes
+from scanner_service.sessions.withdrawals import end_of_scan_utc, ends_of_passes, withdrawn_passes
 from scanner_service.storage.exports.about import About
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.rows import EventRow, SessionRow
@@ -50,7 +50,8 @@ class StoredSession:
     `stages` are in the order of time, the last one that of `results`; of more than MOST_STAGES the first, the last and
     those evenly between are kept, and `pass_ends` says how many there were. `first` is the verdict after the first pass
     where there was more than one. `damaged` tells of lines that are left out because they cannot be read as they were.
-    `losses` is the ledger that the scan left in the record, or one made from the lines alone.
+    `losses` is the ledger that the scan left in the record, or one made from the lines alone; `ended_utc` says when it
+    ended, None where the record does not.
     """
 
     row: SessionRow
@@ -63,6 +64,7 @@ class StoredSession:
     lines: int
     damaged: tuple[str, ...]
     losses: dict[str, Any]
+    ended_utc: str | None
 
     @property
     def about(self) -> About:
@@ -202,6 +204,7 @@ def read_session(
         lines=raw.lines,
         damaged=tuple(damaged),
         losses=_recorded_losses(reader, row) or ledger.to_dict(None),
+        ended_utc=end_of_scan_utc(events),
     )
 
 

@@ -1,4 +1,4 @@
-"""Passes that are taken out of the map, and passes that were closed, as the record's events tell it."""
+"""Passes that are taken out of the map, and passes that were closed and when, as the record's events tell it."""
 
 from collections.abc import Iterable
 
@@ -39,3 +39,9 @@ def withdrawn_passes(events: Iterable[EventRow]) -> set[PassKey]:
 def ends_of_passes(events: Iterable[EventRow]) -> list[int]:
     """After how many lines of the session every pass was closed, in order."""
     return [event.line_number for event in events if event.kind in (SCAN_ENDED, SERVICE_ENDED) and not event.damaged]
+
+
+def end_of_scan_utc(events: Iterable[EventRow]) -> str | None:
+    """When the scan ended last, as the record has it; None while it has not."""
+    times = [event.time_utc for event in events if event.kind in (SCAN_ENDED, SERVICE_ENDED) and not event.damaged]
+    return times[-1] if times else None

@@ -194,6 +194,8 @@ class NativeDevice:
             self._fill(room_bytes)
             if self._pass is None or not self._is_due(self._pass, now_s):
                 break
+            if self._encoder_mm is not None:
+                self._pass.passed_s = now_s
             self._measure(self._pass)
         if self._unseen_end_s is not None and now_s >= self._unseen_end_s and not self._queue:
             self._queue_end(now_s)
@@ -285,7 +287,6 @@ class NativeDevice:
         if self._encoder_mm is None:
             return running.due_s <= now_s
         ahead_mm = self._encoder_mm(now_s) - running.place_nm / NM_PER_MM
-        running.passed_s = now_s
         return math.copysign(1.0, running.step_nm) * ahead_mm >= -self._encoder_mm_per_count
 
     def _measure(self, running: _Pass) -> None:

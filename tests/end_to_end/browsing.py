@@ -12,7 +12,7 @@ import pytest
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 NEEDS_CHROMIUM = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")]
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
 # the software renderer's own remarks on reading pixels
 _RENDERER_REMARKS = ("GPU stall", "GL Driver Message")
 

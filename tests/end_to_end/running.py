@@ -45,7 +45,7 @@ class RunningService:
     def end(self):
         with contextlib.suppress(ProcessLookupError):
             self.process.terminate()
-        self.process.wait(30)
+        self.process.wait(PATIENCE_S)
         self.process.stdout.close()
         self.log.close()
         if hasattr(self, "client"):
@@ -110,7 +110,7 @@ class RunningSimulator:
 
     def end(self):
         self.process.terminate()
-        self.process.wait(10)
+        self.process.wait(PATIENCE_S)
         self.process.stdin.close()
         self.process.stdout.close()
 

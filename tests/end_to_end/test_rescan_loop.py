@@ -1,10 +1,15 @@
 """The closed loop for real: simulator process, pty, service, and `scanner rescan --auto` beside it."""
 
 import json
+import re
 import subprocess
 import sys
 
+import numpy as np
+
+from scanner_service.api.pass_schemas import RIG_OF_A_RECORDING, RigIn
 from tests.end_to_end.running import ROOT
+from tests.unit.storage.ply_files import grid_file
 
 
 def rescan(service, session_id, *arguments):
@@ -30,8 +35,10 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     listed = rescan(service, session_id)
     assert listed.returncode == 0, listed.stderr
     assert json.loads(listed.stdout)["passes"][0]["line_spacing_mm"] < 0.8
+    assert listed.stderr.startswith("planning passes …\n")  # which may take its time on a busy machine
     looped = rescan(service, session_id, "--auto", "--max-passes", "1")
     assert looped.returncode == 0, looped.stderr
+    assert looped.stderr.startswith("planning passes …\n")
     result = json.loads(looped.stdout)
     assert result["loop"]["why_ended"]
     first = result["orders"][0]
@@ -67,7 +74,7 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     assert unclear.status_code == 409 and "reach_mm" in unclear.json()["detail"]
 
 
-def test_a_refused_pass_is_cancelled_and_says_what_to_do(running, service):
+def test_a_pass_of_a_part_that_must_be_turned_says_what_to_do_and_costs_no_order(running, service):
     simulator = running.simulator("step")
     body = {
         "name": "shadowed",
@@ -90,8 +97,47 @@ def test_a_refused_pass_is_cancelled_and_says_what_to_do(running, service):
     order = service.client.post(f"{where}/recommended-passes/{turned['number']}/accept?reason=shadow",
                                 json={"plan": plan["plan"]}).json()["order"]  # fmt: skip
     begun = service.client.post(f"{where}/pass-orders/{order}/carry-out", json={"part_is_turned": False})
-    assert begun.status_code == 409 and "accept the pass again" in begun.json()["detail"]
+    assert (begun.status_code, begun.json()["type"]) == (409, "/problems/part-not-turned")
+    assert '{"part_is_turned": true}' in begun.json()["detail"]
     told = service.client.get(f"{where}/pass-orders/{order}").json()
-    assert (told["status"], told["message"]) == ("cancelled", begun.json()["detail"])
+    assert (told["status"], told["message"]) == ("accepted", None)
     unknown = service.client.get(f"{where}/recommended-passes?region=4711")
     assert unknown.status_code == 404 and "no region 4711" in unknown.json()["detail"]
+
+
+def shown_body():
+    """The body with which the documents state the rig of a recorded scan."""
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    return re.search(r"/rig -d '(\{.*?\})'\n", text, re.DOTALL).group(1)
+
+
+def test_the_body_that_is_shown_is_the_example_of_the_schema():
+    assert json.loads(shown_body()) == RIG_OF_A_RECORDING
+    assert RigIn.model_json_schema()["examples"] == [RIG_OF_A_RECORDING]
+
+
+def test_passes_are_planned_for_a_recorded_scan_once_its_rig_is_stated_as_the_documents_show(service):
+    y_mm, x_mm = np.meshgrid(np.arange(-6.0, 6.0, 0.25), np.arange(-8.0, 8.0, 0.25), indexing="ij")
+    z_mm = np.where(np.abs(x_mm) < 2.0, 6.0, 0.0)  # a bar, of which nobody sees the sides from above
+    points = np.column_stack([x_mm.ravel(), y_mm.ravel(), z_mm.ravel()])
+    recorded = grid_file("ascii", points.tolist(), [[k] for k in range(len(points))], *x_mm.shape)
+    brought = service.client.put("/api/v1/files/bar.ply", content=recorded)
+    assert brought.status_code == 201, brought.text
+    source = {
+        "kind": "replay",
+        "file": "bar.ply",
+        "units": "mm",
+        "laser_mm": [0.0, 0.0, 150.0],
+        "line_spacing_mm": 0.25,
+    }
+    session_id = service.create(**source)
+    where = f"/api/v1/sessions/{session_id}"
+    service.start(session_id)
+    service.wait_for_state(session_id, "stopped")
+    unknown = service.client.get(f"{where}/recommended-passes")
+    assert unknown.status_code == 409 and "PUT .../rig" in unknown.json()["detail"]
+    stated = service.client.put(f"{where}/rig", content=shown_body(), headers={"Content-Type": "application/json"})
+    assert stated.status_code == 200, stated.text
+    plan = service.client.get(f"{where}/recommended-passes")
+    assert plan.status_code == 200, plan.text
+    assert plan.json()["plan"] and plan.json()["passes"]

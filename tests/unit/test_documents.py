@@ -136,6 +136,12 @@ def test_no_file_tells_of_the_place_where_it_was_written():
             assert found is None, f"{path.relative_to(ROOT)}: {found[0]}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_no_page_holds_a_place_that_somebody_meant_to_fill_in(page):
+    found = re.search(r"@[A-Za-z_][\w .-]*@|\{\{.*?\}\}|\bTODO\b|\bFIXME\b|\bXXX\b|\bTBD\b", text_of(page))
+    assert found is None, f"{page.name}: {found[0]}"
+
+
 def test_every_example_of_a_rig_file_is_one_and_its_stage_can_be_opened():
     examples = [
         (page.name, block)

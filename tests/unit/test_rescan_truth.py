@@ -30,7 +30,7 @@ def _sweep(low: float, high: float) -> Sweep:
 def _truth_of(mesh: trimesh.Trimesh) -> tuple:
     samples, caster, sweep = sample_surface(mesh, 0.25), Caster(mesh), _sweep(-1.0, 31.0)
     sight = sight_of(caster, samples, OPTICS, sweep)
-    return samples, sight, truth_of(caster, samples, sight, OPTICS, sweep, 20.0)
+    return samples, sight, truth_of(samples, sight, OPTICS, sweep, 20.0, caster=caster)
 
 
 def test_the_truth_imports_neither_planner_nor_optics() -> None:
@@ -74,7 +74,7 @@ def test_samples_at_other_places_of_a_surface_tell_the_same_shadow() -> None:
     for seed in (1, 2):
         samples = sample_surface(mesh, 0.5, seed)
         sight = sight_of(caster, samples, OPTICS, sweep)
-        said.append((samples, truth_of(caster, samples, sight, OPTICS, sweep, 20.0)["shadow"]))
+        said.append((samples, truth_of(samples, sight, OPTICS, sweep, 20.0, caster=caster)["shadow"]))
     (one, hidden), (other, again) = said
     there, here = (np.column_stack([of.points_mm, 5.0 * of.normals]) for of in (other, one))
     again = again[cKDTree(there).query(here)[1]]

@@ -1,5 +1,7 @@
 """Whether the service lives, is ready, and what it counted; knows no session's insides."""
 
+from dataclasses import asdict
+
 from fastapi import APIRouter, Depends, Request
 from prometheus_client import CONTENT_TYPE_LATEST, generate_latest
 from starlette.responses import Response
@@ -20,11 +22,16 @@ async def healthz() -> Response:
 
 @router.get("/readyz", dependencies=[Depends(public)])
 async def readyz(request: Request) -> Response:
-    """Ready when the kernels are compiled and the record takes lines; 503 until then."""
+    """Ready when the kernels are compiled and the record takes lines; 503 until then.
+
+    `preparing` says what is being compiled: `what`, `step` of how many (`of`), and the `seconds` since it began.
+    """
     service = request.app.state.service
     checks = {"kernels": service.kernels_ready, "record": service.book.record.writer_state().state == "ok"}
     is_ready = all(checks.values())
-    return answer({"status": "ready" if is_ready else "not ready", "checks": checks}, 200 if is_ready else 503)
+    told = None if service.preparing is None else asdict(service.preparing)
+    found = {"status": "ready" if is_ready else "not ready", "checks": checks, "preparing": told}
+    return answer(found, 200 if is_ready else 503)
 
 
 @router.get("/version", dependencies=[Depends(public)])

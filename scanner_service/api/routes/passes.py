@@ -44,8 +44,11 @@ def state_rig(desk: Desk, body: RigIn) -> Response:
 
 @router.get("/recommended-passes", dependencies=[viewer])
 def list_passes(desk: Desk, serving: Served) -> Response:
-    """The recommended passes for the map as it is, the best for its time first, and what none of them can bring."""
-    plan = desk.plan(serving)
+    """The recommended passes for the map as it is, the best for its time first, and what none of them can bring.
+
+    Nothing is changed by that: regions that no pass can bring are marked when a pass is accepted or a loop plans.
+    """
+    plan = desk.foretell(serving)
     return answer({"plan": name_of(plan)} | plan.to_dict())
 
 
@@ -74,10 +77,11 @@ def get_order(desk: Desk, order: int) -> Response:
 def carry_out(desk: Desk, order: int, body: CarryOutIn = CarryOutIn()) -> Response:  # noqa: B008 - it is frozen
     """Drive an accepted pass, or wait for the scanlines that a hand brings. The laser is switched on.
 
-    It may come without a body: then the part is not turned.
+    It may come without a body: then the part is not turned. Where the pass asks for a turn, that is refused and the
+    order waits on.
 
-    An order that is refused is cancelled, and one whose devices do not set off has failed, with the reason as its
-    message.
+    An order that is refused for another reason is cancelled, and one whose devices do not set off has failed, with the
+    reason as its message.
     """
     return answer(desk.carry_out(order, body.part_is_turned).to_dict())
 

@@ -68,7 +68,9 @@ def weighed_like(every: Needs, drawn: Needs, now: Needs) -> Needs:
         rows, some = np.flatnonzero(every.evidence == kind), np.flatnonzero(drawn.evidence == kind)
         if len(rows) and len(some):
             _, nearest = cKDTree(drawn.places_mm[some]).query(every.places_mm[rows])
-            chance[rows] *= (now.chance[some] / drawn.chance[some])[nearest]
+            before = drawn.chance[some]
+            less = np.divide(now.chance[some], before, out=np.ones(len(some)), where=before > 0)  # none has no less
+            chance[rows] *= less[nearest]
     return every.changed(chance=chance)
 
 

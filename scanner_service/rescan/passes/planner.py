@@ -128,16 +128,23 @@ def _thinned(needs: Needs, most: int) -> Needs:
     if len(needs) <= most:
         return needs
     worth = needs.gain_mm2 + _EVEN * float(needs.gain_mm2.mean())
+    if not worth.any():  # nothing is to be had anywhere
+        worth = np.ones(len(needs))
     share = np.minimum(1.0, worth * (most / float(worth.sum())))
     for _ in range(4):  # what is sure to stay leaves room for more of the rest
         rest = share < 1.0
+        if not worth[rest].any():
+            break
         room = most - float(np.count_nonzero(~rest))
         share[rest] = np.minimum(1.0, worth[rest] * (room / float(worth[rest].sum())))
     rng = np.random.default_rng(len(needs))  # the same needs give the same plan
     keep = np.diff(np.floor(np.cumsum(share) + rng.random()), prepend=0.0) > 0
     fewer = needs.only(keep)
     fewer = fewer.changed(area_mm2=fewer.area_mm2 / share[keep])
-    return fewer.changed(area_mm2=fewer.area_mm2 * (float(needs.gain_mm2.sum()) / float(fewer.gain_mm2.sum())))
+    drawn_mm2 = float(fewer.gain_mm2.sum())
+    if drawn_mm2 <= 0.0:
+        return fewer
+    return fewer.changed(area_mm2=fewer.area_mm2 * (float(needs.gain_mm2.sum()) / drawn_mm2))
 
 
 def _recommend(

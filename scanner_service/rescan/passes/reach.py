@@ -51,7 +51,7 @@ class PartTurn:
         stays = (
             ""
             if self.about_mm is None
-            else "; the point {:.0f}, {:.0f}, {:.0f} mm stays in its place".format(*self.about_mm)
+            else "; the point {}, {}, {} mm stays in its place".format(*(round(at) for at in self.about_mm))
         )
         return ", then ".join(said) + stays
 

@@ -34,7 +34,8 @@ _PAPER = "#f6f6f4"
 _INK = "#222222"
 _DOWN = np.array([0.0, 0.0, -1.0])
 _PIXELS = 900
-_LABELS = 60
+_LABELS = 24
+"""So many regions are named, the most urgent ones; more than that nobody can read, and the others are drawn thinner."""
 _LEAST_REACHES = 12.0
 """The picture is at least so many times as wide and high as the reach of one point."""
 
@@ -88,8 +89,8 @@ def density_figure(
     """Draw the density of the surface seen along `direction`; at most 11 inches wide and 8.25 high, at `dpi`.
 
     The scale is absolute, in points per mm², over most of the judged points, with what is required in the middle of the
-    colours. Points that are not reliable or not settled are grey. Regions are outlined with a line style for each
-    reason, and numbered.
+    colours. Points that are not reliable or not settled are grey. Regions, the most urgent first, are outlined with a
+    line style for each reason, and the first twenty-four are numbered.
 
     Parameters
     ----------
@@ -221,7 +222,8 @@ def _rgba(colour: str) -> tuple[float, float, float, float]:
 def _outlines(axes: Axes, regions: Sequence[OutlinedRegion], view: View) -> dict[str, int]:
     """Draw the regions' outlines; how many regions there are of each reason."""
     counts: dict[str, int] = {}
-    for region in regions:
+    for rank, region in enumerate(regions):
+        width = 1.3 if rank < _LABELS else 0.7
         reason = _reason(region)
         counts[reason] = counts.get(reason, 0) + 1
         for loop in _loops(region):
@@ -230,10 +232,10 @@ def _outlines(axes: Axes, regions: Sequence[OutlinedRegion], view: View) -> dict
                 closed @ view.right,
                 closed @ view.up,
                 color="black",
-                linewidth=1.3,
+                linewidth=width,
                 linestyle=_STYLES.get(reason, _OTHER_STYLE),
-                path_effects=[withStroke(linewidth=3.2, foreground="white")],
-                zorder=4,
+                path_effects=[withStroke(linewidth=2.5 * width, foreground="white")],
+                zorder=4 - 0.001 * rank,
             )
     return counts
 
@@ -254,7 +256,7 @@ def _labels(axes: Axes, regions: Sequence[OutlinedRegion], view: View, name: Cal
     boxes = [(loop.min(axis=0), loop.max(axis=0)) for loop in flat]
     span = axes.get_xlim()[1] - axes.get_xlim()[0]
     tall = axes.get_ylim()[1] - axes.get_ylim()[0]
-    size = max(span, tall) * (0.030 if len(named) <= 20 else 0.024)
+    size = max(span, tall) * 0.030
     middles = [pointed_at(loop) for loop in flat]
     halves = [(float(high[0] - low[0]) / 2, float(high[1] - low[1]) / 2) for low, high in boxes]
     places = label_places(middles, halves, (size, 0.8 * size))
@@ -264,7 +266,7 @@ def _labels(axes: Axes, regions: Sequence[OutlinedRegion], view: View, name: Cal
             float(place[0]),
             float(place[1]),
             name(number),
-            fontsize=9 if len(named) <= 20 else 7,
+            fontsize=9,
             fontweight="bold",
             ha="center",
             va="center",
@@ -303,7 +305,8 @@ def _legend(figure: Figure, raster: DensityRaster, shown: dict[str, int], region
         text.set_parse_math(False)
     remark = f"pixel {raster.pixel_mm:.2g} mm; each shows points within {raster.reach_mm:.2g} mm"
     if len(regions) > _LABELS:
-        remark += f"; the {_LABELS} most urgent of {len(regions)} regions are named"
+        others = len(regions) - _LABELS
+        remark += f"; of {len(regions)} regions the {_LABELS} most urgent are named, the {others} others drawn thinner"
     legend.set_title(remark, prop=FontProperties(size=7))
     legend.get_title().set_color("#777777")
 

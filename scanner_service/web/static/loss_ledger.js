@@ -11,6 +11,7 @@ const NAMES = {
   bad_crc: "wrong checksum",
   bad_cobs: "broken framing",
   bytes_skipped: "bytes skipped",
+  late_reads: "times this computer read late",
   points_declared: "points in the file",
   under_way: "under way",
   record_busy: "the disk failed",
@@ -64,7 +65,7 @@ function passAccounts(passes) {
   });
 }
 
-function wireAccounts({ lines, chunks, damage, bytes_skipped: bytesSkipped, duplicates, stale, disagreements }) {
+function wireAccounts({ lines, chunks, damage, bytes_skipped: bytesSkipped, duplicates, stale, disagreements, late_reads: lateReads }) {
   const made = [
     {
       title: "Scanlines on the wire",
@@ -74,7 +75,7 @@ function wireAccounts({ lines, chunks, damage, bytes_skipped: bytesSkipped, dupl
     },
   ];
   if (chunks) made.push({ title: "Chunks on the wire", unit: "sent", total: chunks.sent, rows: [row("stored", chunks.stored, "kept"), ...rows(chunks.lost, "lost", "lost: ")] });
-  const noise = [...rows(damage, "lost", "damage: "), row("bytes_skipped", bytesSkipped, "aside"), row("duplicates", duplicates, "aside"), row("stale", stale, "aside"), row("disagreements", disagreements, "lost")];
+  const noise = [...rows(damage, "lost", "damage: "), row("bytes_skipped", bytesSkipped, "aside"), row("duplicates", duplicates, "aside"), row("stale", stale, "aside"), row("disagreements", disagreements, "lost"), row("late_reads", lateReads, "aside")];
   made.push({ title: "Noise on the wire", unit: "", total: null, rows: noise });
   return made;
 }

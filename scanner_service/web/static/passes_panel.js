@@ -1,10 +1,12 @@
 // Recommended passes beside the picture: the list, buttons to accept and carry out, and what became of each order.
 
 import { byId, element } from "./element.js";
-import { plural, sentence, significant, words } from "./numbers.js";
+import { plural, sentence, significant, whole, words } from "./numbers.js";
 import { acceptPass, cancelOrder, carryOut, endLoop, listOrders, listPasses, loopState, startLoop } from "./service.js";
 
 const FOLLOW_MS = 1000;
+const SAY_MS = 500;
+const SOON_S = 1;
 const unit = (text) => element("span.unit", {}, text);
 
 // Where a pass or an order goes, the same words wherever it is told of.
@@ -36,12 +38,23 @@ export function fate({ status, message, outcome, reached_end: whole }) {
   return [said, explored, early, message].filter(Boolean).join("; ");
 }
 
+// What is said while a plan is made; the seconds are left out while they say nothing.
+export const planning = (seconds) => `Planning passes…${seconds >= SOON_S ? ` ${whole(Math.floor(seconds))} s` : ""}`;
+
+// How far the closed loop is: what it is at, or why it ended.
+export function loopSaid({ running, passes, max_passes: most, why_ended: why }, orders) {
+  if (!running) return `The loop ended: ${why}.`;
+  const scans = orders.some(({ status }) => status === "running");
+  return `Closed loop: ${scans ? `pass ${passes} of at most ${most}` : `planning, ${passes} of at most ${most} passes done`}`;
+}
+
 export class PassesPanel {
   #id = null;
   #asked = 0;
   #state = null; // of the session, as last heard
   #orders = [];
   #timer = null;
+  #saying = null;
 
   // trouble(text); scanned(): a pass has begun or ended, so the session's points flow again, or have changed;
   // onOrder(order): the one that is waited for or carried out, null when there is none; onPass(pass) is pointed at, or null
@@ -61,6 +74,7 @@ export class PassesPanel {
     byId("orders").replaceChildren();
     byId("passes-count").textContent = "";
     byId("loop-note").textContent = "";
+    this.#saysPlanning(false);
     byId("end-loop").hidden = true;
     this.onOrder(null);
     this.onPass(null);
@@ -79,7 +93,7 @@ export class PassesPanel {
     clearTimeout(this.#timer);
     try {
       const [{ orders }, { loop }] = [await listOrders(id), await loopState(id)];
-      const plan = withPlan ? await listPasses(id) : null;
+      const plan = withPlan ? await this.#planned(id) : null;
       if (id !== this.#id || asked !== this.#asked) return;
       const wasRunning = this.#orders.some((order) => order.status === "running");
       const isRunning = orders.some((order) => order.status === "running");
@@ -91,6 +105,28 @@ export class PassesPanel {
     } catch (refusal) {
       if (id === this.#id) this.trouble(refusal.message);
     }
+  }
+
+  // The plan, which may take a while on a busy computer: that it is being made stays in sight until it is there.
+  async #planned(id) {
+    this.#saysPlanning(true);
+    try {
+      return await listPasses(id);
+    } finally {
+      if (id === this.#id) this.#saysPlanning(false);
+    }
+  }
+
+  #saysPlanning(isPlanning) {
+    const note = byId("plan-note");
+    const begun = performance.now();
+    const say = () => (note.textContent = planning((performance.now() - begun) / 1000));
+    clearInterval(this.#saying);
+    note.textContent = "";
+    byId("find-passes").disabled = isPlanning;
+    if (!isPlanning) return;
+    say();
+    this.#saying = setInterval(say, SAY_MS);
   }
 
   async #act(act) {
@@ -116,7 +152,7 @@ export class PassesPanel {
     this.onOrder(orders.findLast(({ status }) => status === "running") ?? orders.findLast(({ status }) => status === "accepted") ?? null);
     byId("end-loop").hidden = !loop?.running;
     byId("run-loop").hidden = Boolean(loop?.running);
-    byId("loop-note").textContent = loop === null ? "" : loop.running ? `Closed loop: pass ${loop.passes} of at most ${loop.max_passes}` : `The loop ended: ${loop.why_ended}.`;
+    byId("loop-note").textContent = loop === null ? "" : loopSaid(loop, orders);
   }
 
   #pass(one, plan) {

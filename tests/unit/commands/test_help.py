@@ -32,6 +32,16 @@ def test_no_help_names_a_type_of_the_language():
     assert [each for each in sorted(told) if TYPES.search(each)] == []
 
 
+def test_lists_of_commands_say_what_each_does_and_cut_nothing():
+    for path, command, context in commands():
+        if hasattr(command, "list_commands"):
+            told = " ".join(command.get_help(context).partition("Commands:")[2].split())
+            assert "..." not in told, path
+            for name in command.list_commands(context):
+                said = " ".join((command.get_command(context, name).help or "").split()).split(". ")[0].rstrip(".")
+                assert said and f"{name} {said}" in told, (path, name)
+
+
 class Terminal(io.StringIO):
     """A stream on which somebody looks."""
 

@@ -49,9 +49,42 @@ def test_a_scan_that_lost_something_says_what_and_why_at_its_end():
     assert "of 1,608 chunks 408 were lost (408 device dropped)" in said
     assert "before start" not in said  # not wanted, and no loss
     assert "lower line rate" in said
+    assert "This computer" not in said
     whole = {"passes": [account | {"chunks": None, "lines": account["lines"] | {"partial": 0, "lost": {}}}
                         for account in _losses()["passes"]]}  # fmt: skip
     assert loss_sentence(whole) == "No scanline was lost, and none is partial."
+
+
+def _read(line_rate_hz=None, late_reads=0, **device):
+    """What a driver counted whose wire carries 71 lines/s."""
+    rates = {} if line_rate_hz is None else {"line_rate_hz": line_rate_hz, "wire_line_rate_hz": 71.0}
+    return rates | {"late_reads": late_reads, "largest_pause_s": 1.26 if late_reads else 0.03} | device
+
+
+@pytest.mark.parametrize(
+    ("device", "scanner", "computer"),
+    [
+        (_read(50.0, late_reads=3), "", "(late 3 times, by up to 1.3 s)"),
+        (_read(50.0, late_reads=1), "", "(late once, by up to 1.3 s)"),
+        (_read(90.0), "wire carries", ""),
+        (_read(90.0, late_reads=3), "wire carries", "by up to 1.3 s"),
+        (_read(50.0), "has time for", ""),
+        (_read(damage={"uart_overrun": 7}), "wire carries", "too busy"),
+        ({}, "wire carries", ""),
+    ],
+)
+def test_what_helps_against_losses_is_told_by_what_was_counted(device, scanner, computer):
+    """A computer that came late to read is no scanner that measured too much, and the other way round."""
+    _, _, advice = loss_sentence(_losses() | {"device": device}).partition(". ")
+    assert ("scanner" in advice.lower(), "computer" in advice) == (bool(scanner), bool(computer))
+    assert scanner in advice and computer in advice
+
+
+def test_lines_that_came_and_found_no_room_are_laid_to_this_computer():
+    first, *_ = _losses()["passes"]
+    lost = first | {"lines": first["lines"] | {"lost": {"host_overflow": 4}}, "chunks": None}
+    said = loss_sentence({"passes": [lost], "device": _read()})
+    assert "This computer was too busy" in said and "scanner" not in said.lower()
 
 
 @pytest.mark.parametrize(

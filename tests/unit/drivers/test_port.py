@@ -46,6 +46,15 @@ def test_bytes_pass_both_ways_unchanged(terminal: tuple[int, str]) -> None:
     port.close()
 
 
+def test_a_port_without_a_switch_for_latency_says_so_in_the_log(
+    terminal: tuple[int, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    _, path = terminal
+    with caplog.at_level("INFO", "drivers.port"):
+        Port(path, 115_200).close()
+    assert f"{path} has no switch for low latency" in caplog.text  # a pseudo-terminal has none
+
+
 def test_a_port_that_is_not_there_is_absent(tmp_path: Path) -> None:
     with pytest.raises(PortAbsent, match="does not exist or is not connected"):
         Port(str(tmp_path / "ttyUSB9"), 115_200)

@@ -359,6 +359,8 @@ def test_tallies_of_boots_add_up_and_are_json() -> None:
         "damage": {"bad_crc": 2},
         "bytes_skipped": 10,
         "no_return": {"too_far": 6},
+        "late_reads": 0,
+        "largest_pause_s": 0.0,
     }
 
 

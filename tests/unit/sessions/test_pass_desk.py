@@ -21,7 +21,7 @@ from scanner_service.rescan.requirement import Requirement
 from scanner_service.sessions import pass_planning
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.closed_loop import LoopLimits
-from scanner_service.sessions.errors import PassUnknown, PlanOvertaken, SessionBusy
+from scanner_service.sessions.errors import PartNotTurned, PassUnknown, PlanOvertaken, SessionBusy
 from scanner_service.sessions.pass_orders import PassStatus
 from scanner_service.sessions.pass_planning import name_of
 from scanner_service.sessions.references import Nominal
@@ -307,11 +307,9 @@ def test_a_part_that_must_be_turned_waits_for_its_operator(book, scanned):
     desk.describe_rig(RigSetup(reach, OPTICS))
     turned = next(one for one in desk.plan().passes if one.turn is not None and not one.turn.is_none)
     order = desk.accept(turned.number)
-    with pytest.raises(SessionBusy, match="part"):
+    with pytest.raises(PartNotTurned, match="part_is_turned"):
         desk.carry_out(order.order_id)
-    assert order.status is PassStatus.CANCELLED and "--turned" in order.message
-    assert told(book, session, "pass_cancelled") == 1
-    order = desk.accept(turned.number)
+    assert order.status is PassStatus.ACCEPTED and order.message is None  # a word that was forgotten costs no order
     desk.carry_out(order.order_id, part_is_turned=True)
     assert order.status is PassStatus.RUNNING
     with pytest.raises(SessionBusy, match="running"):
@@ -319,6 +317,8 @@ def test_a_part_that_must_be_turned_waits_for_its_operator(book, scanned):
     assert order.status is PassStatus.RUNNING  # one that runs is not cancelled by a second request
     session.stop()
     desk.wait_for(order)
+    assert told(book, session, "pass_outcome") == 1
+    assert "pass_cancelled" not in kinds(book, session)
 
 
 def test_a_turned_pass_over_a_part_that_was_not_turned_is_doubted_until_it_is_withdrawn(book, scanned, tmp_path):
@@ -483,6 +483,8 @@ def test_what_no_pose_sees_is_unreachable_until_the_rig_can_do_more(book, scanne
     desk = book.pass_desk(session)
     fixed = RigSetup(linear_reach(), OPTICS)
     desk.describe_rig(fixed)
+    assert desk.foretell().lost_regions  # whoever only looks changes nothing
+    assert not any(region.status is RegionStatus.UNREACHABLE for region in session.results().regions)
     plan = desk.plan()
     lost = {region.region_id for region in session.results().regions if region.status is RegionStatus.UNREACHABLE}
     assert lost == set(plan.lost_regions) and lost

@@ -9,8 +9,9 @@ import pytest
 
 from scanner_service.rescan.requirement import Requirement, RequirementUnusable
 from scanner_service.sessions.book import SessionBook
-from scanner_service.sessions.errors import SessionBusy, SourceUnusable
+from scanner_service.sessions.errors import KernelsCompiling, SessionBusy, SourceUnusable
 from scanner_service.sessions.ledger import Ledger
+from scanner_service.sessions.readiness import preparing, refuse_until_ready, warm_up
 from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec
@@ -214,6 +215,42 @@ def test_while_a_session_is_made_another_is_opened_and_its_place_is_kept(book, s
     done.set()
     made = making.result(60)
     assert book.get(made.row.session_id) is made
+
+
+def test_a_session_is_refused_before_anything_is_opened_while_it_is_too_early(tmp_path, stored, book):
+    def too_early():
+        raise KernelsCompiling("in a moment")
+
+    early = SessionBook(book.record, check_ready=too_early)
+    with pytest.raises(KernelsCompiling, match="in a moment"):
+        early.create("early", DeviceSpec("/dev/pts/none", 9600, 0.2, 0.0, 1.0, 50.0), SETTINGS)  # which is not there
+    with pytest.raises(KernelsCompiling):
+        early.get(stored)
+    with pytest.raises(SessionUnknown):
+        early.get("nobody")
+    assert [row.name for row in early.rows()] == ["stored"]
+    early.close()
+    warm_up()
+    assert preparing() is None
+    refuse_until_ready()  # nobody is refused once all is compiled
+
+
+def test_while_a_session_is_closed_to_make_room_nobody_waits_but_who_wants_that_one(book, monkeypatch, aside):
+    old, kept = (book.create(name, PushSpec(), SETTINGS) for name in ("old", "kept"))
+    old.start()
+    old.stop()
+    monkeypatch.setattr("scanner_service.sessions.book.MAX_LIVE", 2)
+    reached, done = crossing(monkeypatch, old, "close")
+    making = aside(book.create, "new", PushSpec(), SETTINGS)
+    assert reached.wait(60)
+    assert aside(book.get, kept.row.session_id).result(60) is kept
+    assert aside(book.pass_desk, kept).result(60) is book.pass_desk(kept)
+    asking = aside(book.get, old.row.session_id)
+    assert not asking.done()
+    done.set()
+    assert making.result(60).row.name == "new"
+    with pytest.raises(SessionBusy, match="scanning or waiting"):  # its place is taken
+        asking.result(60)
 
 
 def test_while_a_session_is_deleted_another_is_opened_and_it_is_gone_for_all(book, stored, monkeypatch, aside):

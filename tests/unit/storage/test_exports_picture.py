@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scanner_service.analysis.cloud import analyse_cloud
-from scanner_service.storage.exports.density_png import density_png
+from scanner_service.storage.exports.density_png import density_figure, density_png
 from scanner_service.storage.exports.density_raster import rasterise, view_along
 from scanner_service.storage.exports.label_places import label_places
 from tests.unit.storage.map_snapshots import plate
@@ -119,6 +119,22 @@ def test_a_picture_is_a_png_whatever_names_and_regions_there_are(colours):
     height, width = pixels(png)
     assert 390 <= width <= 660
     assert 252 <= height <= 495
+
+
+def test_of_many_regions_the_most_urgent_are_named_and_the_picture_says_how_many_are_not():
+    square = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.2, 0.0], [0.0, 0.2, 0.0]])
+    for count in (3, 62):
+        corners = [np.array([0.3 * (k % 8), 0.3 * (k // 8), 0.0]) for k in range(count)]
+        regions = [Region(100 + k, "sparse", (square + corner,)) for k, corner in enumerate(corners)]
+        figure = density_figure(plate(), regions, session_name="crowd")
+        named = [text.get_text() for text in figure.axes[0].texts]
+        assert named == [str(region.number) for region in regions[:24]]
+        lines = [line for line in figure.axes[0].lines if line.get_path_effects()]
+        assert len(lines) == count  # all are outlined, those without a name more thinly
+        assert {line.get_linewidth() > 1.0 for line in lines[24:]} <= {False}
+        (legend,) = figure.legends
+        remark = legend.get_title().get_text()
+        assert ("of 62 regions the 24 most urgent are named, the 38 others" in remark) == (count == 62)
 
 
 def test_an_empty_map_and_a_single_point_have_a_picture_too():

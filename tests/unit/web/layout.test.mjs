@@ -66,7 +66,7 @@ const LOSSES = {
   device: {
     chunks: { sent: 3300, stored: 3290, lost: { damaged: 9, device_dropped: 1 } },
     lines: { sent: 415, stored: 410, whole: 405, partial: 5, open: 1, lost: { disconnected: 4 } },
-    duplicates: 0, stale: 0, disagreements: 0, damage: { bad_crc: 9 }, bytes_skipped: 4600,
+    duplicates: 0, stale: 0, disagreements: 0, damage: { bad_crc: 9 }, bytes_skipped: 4600, late_reads: 2, largest_pause_s: 0.4,
   },
 };
 
@@ -75,7 +75,7 @@ test("whatever came in is found again in the rows of its account", () => {
   assert.deepEqual(balanced.map(({ title, total }) => [title, total]), [["Points", 1000], ["Scanlines", 410], ["Scanlines on the wire", 415], ["Chunks on the wire", 3300]]);
   for (const { title, total, rows } of balanced) assert.equal(rows.reduce((sum, [, count]) => sum + count, 0), total, title);
   const noise = accounts(LOSSES).find(({ title }) => title === "Noise on the wire");
-  assert.deepEqual(noise.rows.filter(([, count]) => count > 0), [["Damage: wrong checksum", 9, "lost"], ["Bytes skipped", 4600, "aside"]]);
+  assert.deepEqual(noise.rows.filter(([, count]) => count > 0), [["Damage: wrong checksum", 9, "lost"], ["Bytes skipped", 4600, "aside"], ["Times this computer read late", 2, "aside"]]);
 });
 
 test("the headline counts what was lost for good, and no place without a return", () => {

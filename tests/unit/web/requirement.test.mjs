@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 const { inWords, presetOf, reached, refusalsByField, requestOf, textsOf } = await import("../../../scanner_service/web/static/requirement_form.js");
-const { fate, foretold, served } = await import("../../../scanner_service/web/static/passes_panel.js");
+const { fate, foretold, loopSaid, planning, served } = await import("../../../scanner_service/web/static/passes_panel.js");
 const { opening } = await import("../../../scanner_service/web/static/numbers.js");
 
 const STANDARD = { preset: "standard", density_per_mm2: null, density_share: 0.5, line_spacing_mm: null, chord_error_mm: null, finest_line_spacing_mm: 0.05, incidence_deg: null, noise_mm: null, coverage_share: 0.95, interest: null };
@@ -73,4 +73,16 @@ test("a pass names its regions as the list does, an order what became of it", ()
   assert.equal(fate({ status: "done", message: null, outcome, reached_end: true }), "promised 12 (8 to 15), reached 9 mm²; explored: 55 found, 30 (0 to 81) mm² expected");
   assert.equal(fate({ status: "done", message: null, outcome: { ...outcome, promised_mm2: 0 }, reached_end: true }), "explored: 55 found, 30 (0 to 81) mm² expected");
   assert.equal(fate({ status: "failed", message: "the port is gone", outcome: null, reached_end: false }), "the port is gone");
+});
+
+test("while a plan is made that is said, with the seconds once there are some", () => {
+  assert.equal(planning(0.4), "Planning passes…");
+  assert.match(planning(12.7), /^Planning passes… 12 s$/);
+});
+
+test("a loop says whether it scans or plans, and why it ended", () => {
+  const loop = { running: true, passes: 3, max_passes: 20, why_ended: null };
+  assert.equal(loopSaid(loop, [{ status: "done" }, { status: "running" }]), "Closed loop: pass 3 of at most 20");
+  assert.equal(loopSaid(loop, [{ status: "done" }]), "Closed loop: planning, 3 of at most 20 passes done");
+  assert.equal(loopSaid({ ...loop, running: false, why_ended: "nothing is left" }, []), "The loop ended: nothing is left.");
 });

@@ -1,5 +1,6 @@
 """Sights, densities and stretches: against geometry, the simulator, and every other choice."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -156,6 +157,7 @@ def test_turning_the_part_is_the_sensor_going_round_it():
     pose = attitude.motion.part_from_sensor(17.0)
     assert pose.inverse().apply(place) == pytest.approx(moved - np.array([0.0, 17.0, 0.0]), abs=1e-9)
     assert "turn the part by 90°" in str(turn) and str(turn).endswith("the point 0, 20, 0 mm stays in its place")
+    assert "the point 0, 20, 0 mm" in str(dataclasses.replace(turn, about_mm=(-0.2, 20.0, -0.0)))  # no -0
 
 
 def test_the_field_of_view_is_measured_from_the_points():
