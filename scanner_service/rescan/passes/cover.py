@@ -65,6 +65,7 @@ class Cover:
         self._middle_mm = surface.points_mm.mean(axis=0) if len(surface.points_mm) else np.zeros(3)
         self.attitudes = reach.attitudes(self._middle_mm)
         self.left_mm2 = needs.gain_mm2.copy()
+        self._least_cosine = np.cos(np.minimum(optics.limit_rad(needs.thin), needs.incidence_rad))
         self._visible: BoolArray = np.array([self._roughly_seen(attitude) for attitude in self.attitudes])
         self.reachable: BoolArray = np.asarray(self._visible.any(axis=0))
 
@@ -114,7 +115,7 @@ class Cover:
         laser = attitude.rotation @ (geometry.laser_mm / np.linalg.norm(geometry.laser_mm))
         camera = attitude.rotation @ (geometry.camera_mm / np.linalg.norm(geometry.camera_mm))
         seen: BoolArray = (
-            (needs.normals @ laser >= np.cos(np.minimum(self._optics.max_incidence_rad, needs.incidence_rad)))
+            (needs.normals @ laser >= self._least_cosine)
             & (needs.normals @ camera >= math.cos(self._optics.max_camera_rad))
             & self._sky.along(laser)
             & self._sky.along(camera)

@@ -68,7 +68,7 @@ def prospect_of(surface: KnownSurface, needs: Needs, motion: Motion, optics: Sca
         by_lines = needs.spacing_mm * sine / (SLACK * sights.advance)
     low, high = optics.geometry.range_mm
     met = np.isfinite(sights.position_mm) & (density > 0)
-    too_steep = ~(cosine >= np.cos(np.minimum(optics.max_incidence_rad, needs.incidence_rad))) | ~(
+    too_steep = ~(cosine >= np.cos(np.minimum(optics.limit_rad(needs.thin), needs.incidence_rad))) | ~(
         camera >= math.cos(optics.max_camera_rad)
     )
     out_of_range = ~((sights.local_mm[:, 2] >= low) & (sights.local_mm[:, 2] <= high))

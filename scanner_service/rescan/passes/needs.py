@@ -36,6 +36,7 @@ _REST_MM = 6.0  # a rest this far from known surface is half as likely as one th
 _ANOTHER = 0.7  # a noisy place is looked at from at most this share of the angle at which it was noisy
 _HEAD_ON_RAD = math.radians(20.0)  # ... and nearer to the normal than this no direction is better
 _OUTNUMBER = 1.25
+_LEAST_LACKING = 0.25  # share of the density asked for that a steep place lacks at least, when its points fail
 UNSEEN = 0
 """The region number of surface that no point has touched, and that no region has found."""
 
@@ -68,7 +69,8 @@ class Needs:
     `region` (n,) is the number of the region they belong to (UNSEEN: none), `evidence` (n,) why they are believed in,
     `chance` (n,) how likely they are what they seem, `tried` (n,) where passes were in vain. What a pass must bring
     there: `density_per_mm2` (n,), lines at most `spacing_mm` (n,) apart on the surface, and rays at most
-    `incidence_rad` (n,) from the normal.
+    `incidence_rad` (n,) from the normal. `thin` (n,) is surface with too few points because it was seen too steeply:
+    `density_per_mm2` is what it lacks, and rays somewhat steeper than elsewhere will do (`ScannerOptics.limit_rad`).
     """
 
     places_mm: Float64Array
@@ -80,6 +82,7 @@ class Needs:
     chance: Float64Array
     spacing_mm: Float64Array
     incidence_rad: Float64Array
+    thin: BoolArray
     tried: BoolArray
 
     def __post_init__(self) -> None:
@@ -104,8 +107,8 @@ class Needs:
         none = np.zeros(n, dtype=np.int64)
         density, chance = np.full(n, density_per_mm2), np.ones(n)
         far, wide = np.full(n, np.inf), np.full(n, 0.5 * np.pi)
-        fresh = np.zeros(n, dtype=np.bool_)
-        return cls(places_mm, normals, area_mm2, none, none.copy(), density, chance, far, wide, fresh)
+        thin, fresh = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+        return cls(places_mm, normals, area_mm2, none, none.copy(), density, chance, far, wide, thin, fresh)
 
     def changed(self, **columns: npt.NDArray[Any]) -> "Needs":
         """With other values in some columns."""
@@ -134,12 +137,14 @@ class Wanted:
     """What surface must get: a density, and where it is asked for a line spacing on it and an incidence.
 
     `by_judgement`: where points were judged, the line spacing that the judgement allows there counts (chord error).
+    `tops_up`: steep surface asks only for the points that it lacks, from somewhat steeper rays too.
     """
 
     density_per_mm2: float
     line_spacing_mm: float = math.inf
     incidence_rad: float = 0.5 * math.pi
     by_judgement: bool = False
+    tops_up: bool = False
 
     @classmethod
     def of(cls, density_per_mm2: float, requirement: Requirement | None) -> "Wanted":
@@ -195,6 +200,7 @@ def find_needs(
     needs = Needs(
         places, normals, area, region, evidence, np.full(n, wanted.density_per_mm2), chance,
         np.full(n, wanted.line_spacing_mm), np.full(n, wanted.incidence_rad), np.zeros(n, dtype=np.bool_),
+        np.zeros(n, dtype=np.bool_),
     )  # fmt: skip
     return _as_judged(snapshot, report, surface, needs, wanted)
 
@@ -316,10 +322,13 @@ def _bare(regions: Sequence[RescanRegion], served: set[int]) -> Columns:
 def _as_judged(
     snapshot: MapSnapshot, report: RegionReport, surface: KnownSurface, needs: Needs, wanted: Wanted
 ) -> Needs:
-    """What each measured place asks for by the verdict on its own points: line spacing by chord, another direction."""
+    """What each measured place asks for by the verdict on its own points: line spacing by chord, another direction.
+
+    Steep surface is met by many passes a little: where it is topped up, only what is lacking is asked for.
+    """
     measured = np.flatnonzero(needs.evidence == Evidence.MEASURED)
-    noisy = report.reason == Reason.NOISY
-    if not len(measured) or not (wanted.by_judgement or noisy.any()):
+    noisy, steep = report.reason == Reason.NOISY, (report.reason == Reason.STEEP) & wanted.tops_up
+    if not len(measured) or not (wanted.by_judgement or noisy.any() or steep.any()):
         return needs
     spacing, incidence, density = (
         column.copy() for column in (needs.spacing_mm, needs.incidence_rad, needs.density_per_mm2)
@@ -333,6 +342,12 @@ def _as_judged(
     rows, need = rows[mine], measured[order][at[mine]]
     if wanted.by_judgement:
         np.fmin.at(spacing, need, report.judgement.allowed_mm[rows])
+    at_steep, steep_rows = need[steep[rows]], rows[steep[rows]]
+    n_steep = np.bincount(at_steep, minlength=len(needs))
+    there = np.bincount(at_steep, snapshot.side_density_per_mm2[steep_rows], len(needs)) / np.maximum(n_steep, 1)
+    lacking = np.maximum(density - there, _LEAST_LACKING * density)
+    thin = (2 * n_steep > np.bincount(need, minlength=len(needs))) & (there < density)
+    density[thin] = lacking[thin]
     loud = noisy[rows]
     ray = snapshot.lines.laser_mm[snapshot.line[rows[loud]]] - snapshot.points_mm[rows[loud]]
     cosine = np.abs(np.einsum("ij,ij->i", ray, snapshot.normals[rows[loud]])) / np.linalg.norm(ray, axis=1)
@@ -341,7 +356,7 @@ def _as_judged(
     # the old points stay: good ones must outnumber them
     count = np.bincount(need[loud], minlength=len(needs)).astype(np.float64)
     density = np.maximum(density, _OUTNUMBER * count / np.maximum(needs.area_mm2, 1e-9))
-    return needs.changed(spacing_mm=spacing, incidence_rad=incidence, density_per_mm2=density)
+    return needs.changed(spacing_mm=spacing, incidence_rad=incidence, density_per_mm2=density, thin=thin)
 
 
 def _apart(surface: KnownSurface, places: Float64Array, normals: Float64Array, evidence: IntArray) -> BoolArray:

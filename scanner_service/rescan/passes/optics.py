@@ -5,11 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.scanline import Float64Array, SensorGeometry
+from drivers.scanline import BoolArray, Float64Array, SensorGeometry
 from scanner_service.rescan.passes.errors import OpticsUnknown
 
 MAX_INCIDENCE_RAD = math.radians(60.0)
 """Beyond this the incidence dominates the error of a laser-line scanner, and returns become rare."""
+
+
+THIN_RAD = math.radians(15.0)
+"""So much steeper may rays be that bring more points to where some are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +54,11 @@ class ScannerOptics:
         laser, camera = self.geometry.laser_mm, self.geometry.camera_mm
         cosine = float(laser @ camera) / float(np.linalg.norm(laser) * np.linalg.norm(camera))
         return math.acos(max(-1.0, min(1.0, cosine)))
+
+    def limit_rad(self, thin: BoolArray) -> Float64Array:
+        """(n,) largest incidence at which a place is looked at: a larger one where it is `thin` (n,), see `Needs`."""
+        steeper = min(self.max_incidence_rad + THIN_RAD, self.max_camera_rad)
+        return np.where(thin, max(steeper, self.max_incidence_rad), self.max_incidence_rad)
 
     def widening(self, z_mm: Float64Array) -> Float64Array:
         """How much wider than at z = 0 the fan is at z (n,)."""

@@ -1,13 +1,14 @@
 """From a judged map to recommended passes: what is wanted, what the rig can see of it, and in which order; pure."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from drivers.scanline import BoolArray, Pose
 from scanner_service.analysis.snapshot import MapSnapshot
+from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.behind import weighed, weighed_like
 from scanner_service.rescan.passes.cover import Choice, Cover
 from scanner_service.rescan.passes.gain import MARGIN, SERVED, Prospect, prospect_of
@@ -44,7 +45,8 @@ class Wishes:
     `requirement` asks for more than a density: line spacing, chord error, incidence. `serving` names what is to be
     served; unseen surface only when nothing is named. `explore` reckons with surface where hidden space begins,
     outside of any region. `learned` is how much good surface each kind of evidence has proved to bring
-    (`experience.experience_of`).
+    (`experience.experience_of`). `tops_up`: steep surface asks only for the points that it lacks, from
+    somewhat steeper rays too; a plan that finds nothing otherwise does so by itself.
     """
 
     density_per_mm2: float
@@ -55,6 +57,7 @@ class Wishes:
     cell_mm: float | None = None
     requirement: Requirement | None = None
     serving: Serving = EVERYTHING
+    tops_up: bool = False
 
 
 def plan_passes(
@@ -86,7 +89,7 @@ def plan_passes(
     pieces = None if reference is None else reference.pieces
     surface = know_surface(snapshot, fails, region, wishes.cell_mm, looks, optics, pieces)
     missing = None if reference is None else missing_of(reference, regions)
-    wanted = Wanted.of(wishes.density_per_mm2, wishes.requirement)
+    wanted = replace(Wanted.of(wishes.density_per_mm2, wishes.requirement), tops_up=wishes.tops_up)
     needs = find_needs(snapshot, report, surface, wanted, wishes.learned.chances, wishes.explore, regions, missing)
     if not wishes.serving.is_everything:
         named = [one.number for one in regions if wishes.serving.wants(one)]
@@ -112,6 +115,9 @@ def plan_passes(
         one = _recommend(len(passes) + 1, choice, every, prospect, served, reach, standing, wishes)
         passes.append(one)
         standing = one.end_pose
+    if not (passes or wishes.tops_up) and (report.reason == Reason.STEEP).any():
+        last = replace(wishes, tops_up=True)
+        return plan_passes(snapshot, report, reach, optics, last, standing, tried, looks, regions, reference)
     lost = unreachable(needs, cover.reachable, cover.attitudes, sky, optics) + in_vain(given_up, needs)
     needed = float(needs.gain_mm2.sum() + given_up.gain_mm2.sum())
     asked = frozenset(np.unique(needs.region[cover.reachable]).tolist()) - {UNSEEN}

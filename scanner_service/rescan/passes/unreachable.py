@@ -28,9 +28,10 @@ def unreachable(
     why = np.full(len(needs), "no pass within the rig's limits reaches it with laser and camera", dtype=object)
     faced, lit = np.zeros(len(needs), dtype=np.bool_), np.zeros(len(needs), dtype=np.bool_)
     laser = optics.geometry.laser_mm / np.linalg.norm(optics.geometry.laser_mm)
+    least_cosine = np.cos(optics.limit_rad(needs.thin))
     for attitude in attitudes:
         direction = attitude.rotation @ laser
-        facing = needs.normals @ direction >= math.cos(optics.max_incidence_rad)
+        facing = needs.normals @ direction >= least_cosine
         faced |= facing
         lit |= facing & sky.along(direction)
     degrees = math.degrees(optics.max_incidence_rad)

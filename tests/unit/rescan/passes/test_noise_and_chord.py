@@ -1,4 +1,4 @@
-"""Plans for what is noisy and for what is curved: from where a noisy place is looked at, how close lines must lie."""
+"""Plans by verdicts: from where noisy and steep places are looked at, how close lines must lie on curved ones."""
 
 import dataclasses
 import math
@@ -12,12 +12,13 @@ from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.requirement import Requirement
 from simulators.parts import plate
 from simulators.shapes import Sphere
-from tests.unit.rescan.passes.posed_scans import FROM_ABOVE, OPTICS, SCANNER, Bench, free_reach, linear_reach
+from tests.unit.rescan.passes.posed_scans import DENSITY, FROM_ABOVE, OPTICS, SCANNER, Bench, free_reach, linear_reach
 
 CHORD_MM = 0.002
 SPARSE = 2.0  # points/mm2 that any of these scans has
 RADIUS_MM = 12.0
 TILT_RAD = math.radians(50.0)
+STEEP_RAD = math.radians(66.0)
 
 
 def failing_share(judged):
@@ -65,3 +66,28 @@ def test_a_noisy_place_is_looked_at_from_nearer_to_its_normal_and_until_good_poi
     new = report.judgement.fails[snapshot.lines.pass_number[snapshot.line] == 1]
     assert new.mean() < 0.05
     assert failing_share((snapshot, report)) < 0.5 * failing_share(before)
+
+
+def test_when_nothing_else_is_left_steep_surface_is_asked_for_what_it_lacks_from_somewhat_steeper_too():
+    cosine, sine = math.cos(STEEP_RAD), math.sin(STEEP_RAD)
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])  # the camera's side is turned down
+    aslant = StraightMotion(Pose(turn, np.array([0.0, 20.0, 0.0])), turn[:, 1].copy())
+    bench = Bench(plate().surface).scan(aslant, -9.0, 9.0, 0.25)
+    before = bench.judged()
+    assert (before[1].reason == Reason.STEEP).mean() > 0.5
+    only_so = dataclasses.replace(free_reach(max_tilt_deg=2.0), up=aslant.at_zero.rotation[:, 2].copy())
+    wishes = Wishes(DENSITY, max_passes=1, explore=False)
+    better = plan_passes(*before, free_reach(), OPTICS, wishes).passes[0]
+    assert all(promise.largest_incidence_rad <= OPTICS.max_incidence_rad for promise in better.promises)
+    assert all(promise.density_per_mm2 >= DENSITY for promise in better.promises)
+    one = plan_passes(*before, only_so, OPTICS, wishes).passes[0]
+    assert all(60.0 < math.degrees(promise.largest_incidence_rad) <= 75.0 for promise in one.promises)
+    assert all(promise.density_per_mm2 < DENSITY for promise in one.promises)
+    bench.scan(one.motion, one.start_mm, one.end_mm, one.line_spacing_mm)
+    after = bench.judged()
+    assert float(np.median(before[0].side_density_per_mm2)) < DENSITY < float(np.median(after[0].side_density_per_mm2))
+    assert failing_share(after) < 0.6 * failing_share(before)  # lines of one direction may lie close in pairs
+
+    head_on = Requirement(density_per_mm2=DENSITY, incidence_rad=math.radians(60.0))
+    strict = dataclasses.replace(wishes, requirement=head_on)
+    assert not plan_passes(*before, only_so, OPTICS, strict).passes
