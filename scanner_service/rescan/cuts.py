@@ -2,7 +2,7 @@
 
 They check nothing, and know no map. What comes out does not hang on the order of the points, nor on points outside of a
 cut. Lengths are millimetres in the part frame, k counts gaps, n points. A gap goes from its start along its unit way to
-its end; its cut is the plane through it with the unit normal.
+its end; its cut is the plane through it with the unit normal, and what it hides lies in it along normal x way.
 
 Points stand in columns, a tuple of: places (n, 3), where each column begins (c + 1,), the lowest corner (2,), the side,
 and how many columns there are along x and along y.
@@ -35,7 +35,7 @@ def find_steps(columns, rows, groups, borders, starts, ends, ways, normals, own,
     at both ends of each step, -1 where there are fewer, and `alone` (k,), True where no other pass has a point in the
     cut. On entry `found` holds the rows of the start and the end; where a gap is alone it still does.
     """
-    taken = np.full((_SIDE, _SIDE), -1, dtype=np.int64)
+    taken, seen = np.full((_SIDE, _SIDE), -1, dtype=np.int64), np.zeros((_SIDE, _SIDE), dtype=np.bool_)
     u, v, row = np.empty(_SIDE * _SIDE), np.empty(_SIDE * _SIDE), np.empty(_SIDE * _SIDE, dtype=np.int64)
     for k in range(len(starts)):
         length = math.sqrt(((ends[k] - starts[k]) ** 2).sum())
@@ -43,7 +43,7 @@ def find_steps(columns, rows, groups, borders, starts, ends, ways, normals, own,
         while True:
             count, others = _cut(
                 columns, rows, groups, borders, starts[k], length, ways[k], normals[k], own[k], reaches[k], fine,
-                taken, u, v, row,
+                taken, seen, u, v, row,
             )  # fmt: skip
             if count <= _MOST:
                 break
@@ -53,7 +53,7 @@ def find_steps(columns, rows, groups, borders, starts, ends, ways, normals, own,
             continue
         first, last = found[k, 0]
         u[count], v[count], row[count] = length, 0.0, last
-        before, width = _chain(u, v, count)
+        before, width = _chain(u, v, count, reaches[k])
         enough = max(min(_TOUCHING * reaches[k], _SHARE * length), fine / _THIN)  # thinned points are further apart
         found[k] = -1
         for n in range(STEPS):
@@ -75,16 +75,17 @@ def find_steps(columns, rows, groups, borders, starts, ends, ways, normals, own,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cut(columns, rows, groups, borders, start, length, way, normal, own, reach, fine, taken, u, v, row):
+def _cut(columns, rows, groups, borders, start, length, way, normal, own, reach, fine, taken, seen, u, v, row):
     """The points near the plane of a gap, one a cell of side `fine`: how many, and whether other passes have any.
 
     Of those in a cell one at a border stands for all, then the one of the lowest row. `u` along the gap, `v` across it
     and `row` are written; `taken` is all -1 before and after. Points for which the way by them is longer than DETOUR
-    times the gap are left out: an ellipse around it.
+    times the gap are left out, an ellipse around it; so are those on the side that the gap does not hide, and cells in
+    which its own pass `own` has a point: what that has seen is not hidden from it. `seen` is False before and after.
     """
     places, begin, lowest, side, many_x, many_y = columns
     across = np.cross(normal, way)
-    count, others = 0, False
+    count = 0
     half, rest = 0.5 * DETOUR * length, 0.5 * math.sqrt(DETOUR * DETOUR - 1.0) * length
     first, last = np.empty(2, dtype=np.int64), np.empty(2, dtype=np.int64)
     for axis in range(2):
@@ -100,11 +101,15 @@ def _cut(columns, rows, groups, borders, start, length, way, normal, own, reach,
                     continue
                 a = x * way[0] + y * way[1] + z * way[2]
                 b = x * across[0] + y * across[1] + z * across[2]
+                if b < -reach:
+                    continue
                 if math.sqrt(a * a + b * b) + math.sqrt((a - length) ** 2 + b * b) > DETOUR * length:
                     continue
-                others |= groups[n] != own
                 p = int((a - 0.5 * length + half) / fine)
                 q = int((b + half) / fine)
+                if groups[n] == own:
+                    seen[p, q] = True
+                    continue
                 at = taken[p, q]
                 if at < 0:
                     at = taken[p, q] = count
@@ -114,19 +119,29 @@ def _cut(columns, rows, groups, borders, start, length, way, normal, own, reach,
                 ):
                     continue
                 u[at], v[at], row[at] = a, b, rows[n]
+    others, kept = count > 0, 0
     for n in range(count):
-        taken[int((u[n] - 0.5 * length + half) / fine), int((v[n] + half) / fine)] = -1
-    return count, others
+        p, q = int((u[n] - 0.5 * length + half) / fine), int((v[n] + half) / fine)
+        taken[p, q] = -1
+        if not seen[p, q]:
+            u[kept], v[kept], row[kept] = u[n], v[n], row[n]
+            kept += 1
+    seen[:] = False
+    return kept, others
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _chain(u, v, last):
+def _chain(u, v, last, slack):
     """Prim's tree over places (u, v) from (0, 0) until it reaches the place `last`.
 
     Of all ways there it has the one whose widest step is the least. For each place the one before it (-1: the start),
-    and the width of the step between.
+    and the width of the step between; the first and the last are shorter by `slack`, since what the gap's own pass saw
+    around both ends is left out.
     """
-    width, before = np.sqrt(u[: last + 1] ** 2 + v[: last + 1] ** 2), np.full(last + 1, -1, dtype=np.int64)
+    width, before = (
+        np.maximum(np.sqrt(u[: last + 1] ** 2 + v[: last + 1] ** 2) - slack, 0.0),
+        np.full(last + 1, -1, dtype=np.int64),
+    )
     done = np.zeros(last + 1, dtype=np.bool_)
     while True:
         at = -1
@@ -139,6 +154,8 @@ def _chain(u, v, last):
         for n in range(last + 1):
             if not done[n]:
                 away = math.sqrt((u[n] - u[at]) ** 2 + (v[n] - v[at]) ** 2)
+                if n == last:
+                    away = max(away - slack, 0.0)
                 if away < width[n]:
                     width[n], before[n] = away, at
 

@@ -1,9 +1,10 @@
 """What the other passes have left of a shadow: the widest place in it without a point; judges nothing.
 
 A shadow hides surface between its two ends. Cut through it along the rays that jump: the hidden surface is a curve in
-that plane from one end to the other, wherever it goes in between. So the points of all passes near the plane are a
+that plane from one end to the other, wherever it goes in between. So the points of other passes near the plane are a
 chain from end to end once the surface is seen, whatever the wall and the floor behind the rim look like; until then
 the chain breaks, and its widest step is what is left. Two points belong together when their neighbourhoods touch.
+Points that the gap's own pass has seen, or that lie on the side it looks from, belong to no such chain.
 
 A cut may also meet two bodies, or the two walls of a hole, with nothing between but air. A step is no surface when what
 was measured goes on all around both of its ends, when these look straight at each other, or when rays went through all
@@ -61,6 +62,8 @@ def left_by_others(
     way, group = _unit(end - start), gaps.group[rows]
     aside = np.where(gaps.across[rows, None], frames.along[group], np.cross(frames.along[group], frames.axis[group]))
     normal = _unit(aside - way * np.einsum("ij,ij->i", aside, way)[:, None])
+    towards_seen = np.einsum("ij,ij->i", np.cross(normal, way), _onward(snapshot, gaps, rows))
+    normal = np.where(towards_seen[:, None] > 0, -normal, normal)
     kept, columns = _in_columns(snapshot, points)
     steps, alone = np.repeat(ends[:, None], STEPS, axis=1), np.zeros(len(rows), dtype=np.bool_)
     find_steps(
@@ -76,6 +79,14 @@ def left_by_others(
     left[~is_left.any(axis=1)] = NOTHING
     left[~is_left.any(axis=1) & air.any(axis=1)] = AIR
     return _nearer_first(snapshot, np.where(alone[:, None], ends, left), snapshot.lines.laser_mm[gaps.line[rows]])
+
+
+def _onward(snapshot: MapSnapshot, gaps: Gaps, rows: IntArray) -> Float64Array:
+    """(k, 3) the way from the ray of the upper end to that of the lower: where it goes on to, the pass has seen."""
+    high, low = gaps.high[rows], gaps.low[rows]
+    lasers = snapshot.lines.laser_mm[snapshot.line[high]], snapshot.lines.laser_mm[snapshot.line[low]]
+    rays = _unit(snapshot.points_mm[high] - lasers[0]), _unit(snapshot.points_mm[low] - lasers[1])
+    return np.asarray(np.where(gaps.across[rows, None], lasers[1] - lasers[0], rays[1] - rays[0]))
 
 
 def _is_air(

@@ -13,6 +13,7 @@ from scanner_service.api.app import make_app
 from scanner_service.api.keys import read_local_key
 from scanner_service.api.server import ServerThread
 from scanner_service.api.service import Service
+from scanner_service.sessions.readiness import warm_up
 from tests.unit.rescan.test_reference import block
 
 
@@ -23,6 +24,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def client(folder: Path) -> Iterator[httpx.Client]:
+    warm_up()  # nobody is refused once all is compiled
     service = Service.open(folder)
     try:
         with ServerThread(make_app(service)) as listening:

@@ -365,8 +365,10 @@ def test_a_revoked_key_and_a_logout_end_the_streams_that_were_opened_with_them(t
     from scanner_service.api.keys import Role
     from scanner_service.api.server import ServerThread
     from scanner_service.api.service import Service
+    from scanner_service.sessions.readiness import warm_up
     from scanner_service.sessions.source_specs import PushSpec
 
+    warm_up()  # nobody is refused once all is compiled
     service = Service.open(tmp_path)
     try:
         session = service.book.create("watched", PushSpec())

@@ -12,6 +12,7 @@ from scanner_service.api.server import ServerThread
 from scanner_service.api.service import Service
 from scanner_service.sessions.exporting import FORMATS
 from scanner_service.sessions.replay_source import ReplaySource
+from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
 from tests.unit.analysis.scans import surface_scan
@@ -20,6 +21,7 @@ from tests.unit.analysis.scans import surface_scan
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
     """A service with one finished session: its address, keys by role, and the session's id."""
+    warm_up()  # nobody is refused once all is compiled
     service = Service.open(tmp_path_factory.mktemp("data"))
     lines = surface_scan(lambda x, y: 0.0 * x, lines=12)
     session = service.book.create(

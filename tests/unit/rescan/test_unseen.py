@@ -113,3 +113,16 @@ def test_a_shadow_is_listed_as_long_as_something_of_it_is_missing_and_no_longer(
     for true, _, shadows in stages(part):
         missing_mm2 = (1.0 - true) * whole_mm2
         assert 0.4 * missing_mm2 - 3.0 <= shadows <= 2.0 * missing_mm2 + 3.0, stages(part)
+
+
+FENCED = Union(SLAB, box((-9.0, 2.0, -1.0), (9.0, 10.0, 9.0)), box((-6.0, 14.0, -1.0), (6.0, 14.4, 4.0)))
+"""A block, and a thin wall in front of it: from above, the step from its rim to the wall's top is the shorter one."""
+
+
+def test_a_pass_from_where_nothing_more_is_seen_takes_nothing_from_a_shadow() -> None:
+    bench, told = Bench(FENCED), []
+    for _ in range(3):
+        _, report = bench.scan(FROM_ABOVE, 0.0, 24.0, 0.25).judged(ASKED)
+        told.append(sum(region.area_mm2 for region in report.regions if region.reason is Reason.SHADOW))
+    assert told[0] > 200.0
+    assert told[1:] == pytest.approx([told[0]] * 2, rel=0.12), told
