@@ -11,8 +11,8 @@ from scanner_service.api.keys import Role
 from scanner_service.api.server import ServerThread
 from scanner_service.api.service import Service
 from scanner_service.sessions.exporting import FORMATS
-from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.readiness import warm_up
+from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
 from tests.unit.analysis.scans import surface_scan

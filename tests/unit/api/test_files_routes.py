@@ -10,6 +10,7 @@ from scanner_service.api.app import make_app
 from scanner_service.api.keys import Role
 from scanner_service.api.server import ServerThread
 from scanner_service.api.service import Service
+from scanner_service.sessions.readiness import warm_up
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.storage.errors import RecordUnusable
 from scanner_service.storage.record import Record
@@ -18,6 +19,7 @@ from scanner_service.storage.record import Record
 @pytest.fixture
 def operator(tmp_path):
     (tmp_path / "data").mkdir()
+    warm_up()  # compiling and describing routes both play with the list of warnings, which is one for all threads
     service = Service.open(tmp_path / "data")
     key = service.access.create_key(Role.OPERATOR, "bringer")
     with (
