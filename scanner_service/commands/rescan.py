@@ -43,6 +43,8 @@ def rescan_command(
     with plain_errors():
         if sum((auto, carry_out is not None, cancel is not None)) > 1:
             fail("say one of --pass, --auto and --cancel")
+        if coverage is not None and not auto:
+            fail("--coverage ends a loop: say --auto as well")
         if (carry_out is None) != (plan is None):
             fail(
                 "say --pass and --plan together: the plan is named below the list of passes, and what the number means "

@@ -105,7 +105,9 @@ class Reach:
     def __post_init__(self) -> None:
         limits = self.limits
         if limits.axis is AxisKind.FREE_POSE and limits.reach_mm is None:
-            raise RigUnlimited("a free pose needs a box of positions the sensor can take: state reach_mm of the rig")
+            raise RigUnlimited(
+                "a free pose needs a box of positions the sensor can take: state reach_low_mm and reach_high_mm of the rig"
+            )
         if not (math.isfinite(limits.line_rate_hz[1]) and limits.line_rate_hz[1] > 0):
             raise RigUnlimited("no pass can be timed without the scanner's highest line rate: state line_rate_hz")
         if limits.axis is not AxisKind.FREE_POSE and not all(map(math.isfinite, limits.travel_mm)):

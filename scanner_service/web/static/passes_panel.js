@@ -21,7 +21,8 @@ export function served(pass) {
 }
 
 // An area as it was foretold, with the interval in which it lies four times in five: "12 (8 to 15)".
-const area = (mm2, between) => `${significant(mm2)}${between ? ` (${significant(between[0], 2)} to ${significant(between[1], 2)})` : ""}`;
+const bound = (mm2) => (Math.abs(mm2) < 0.05 ? "0" : significant(mm2, 2));
+const area = (mm2, between) => `${significant(mm2)}${between ? ` (${between.map(bound).join(" to ")})` : ""}`;
 
 // What a pass promises, and what it explores: "promises 12 (8 to 15), explores for 30 (0 to 80) mm²".
 export function foretold({ promised_mm2, promised_between_mm2, explores_mm2, explores_between_mm2 }) {

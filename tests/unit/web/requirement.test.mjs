@@ -60,6 +60,8 @@ test("a pass says what it promises, what it explores, and between what both will
   const pass = { promised_mm2: 12, promised_between_mm2: [8.04, 15], explores_mm2: 30, explores_between_mm2: [0, 81.3] };
   assert.equal(foretold(pass), "promises 12 (8 to 15), explores for 30 (0 to 81) mm²");
   assert.equal(foretold({ ...pass, explores_mm2: 0.1 }), "promises 12 (8 to 15) mm²");
+  const hardly = foretold({ ...pass, explores_mm2: 31.1, explores_between_mm2: [3.6e-15, 85] });
+  assert.equal(hardly, "promises 12 (8 to 15), explores for 31.1 (0 to 85) mm²");
   assert.equal(foretold({ ...pass, promised_mm2: 0 }), "explores for 30 (0 to 81) mm²");
 });
 
