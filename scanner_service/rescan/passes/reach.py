@@ -106,7 +106,7 @@ class Reach:
         limits = self.limits
         if limits.axis is AxisKind.FREE_POSE and limits.reach_mm is None:
             raise RigUnlimited(
-                "a free pose needs a box of positions the sensor can take: state reach_low_mm and reach_high_mm of the rig"
+                "a free pose needs a box of positions the sensor may take: state reach_low_mm and reach_high_mm"
             )
         if not (math.isfinite(limits.line_rate_hz[1]) and limits.line_rate_hz[1] > 0):
             raise RigUnlimited("no pass can be timed without the scanner's highest line rate: state line_rate_hz")
