@@ -71,7 +71,7 @@ def test_a_coarse_scan_is_mended_by_the_loop_and_every_step_is_in_the_record(run
     unclear = service.client.put(f"/api/v1/sessions/{session_id}/rig", json={
         "axis": "free_pose", "scanner": {"laser_mm": [0, 0, 150], "camera_mm": [0, 76, 150], "range_mm": [-30, 30],
                                          "field_of_view_mm": 50, "points_per_line": 400}})  # fmt: skip
-    assert unclear.status_code == 409 and "reach_mm" in unclear.json()["detail"]
+    assert unclear.status_code == 409 and "reach_low_mm" in unclear.json()["detail"]
 
 
 def test_a_pass_of_a_part_that_must_be_turned_says_what_to_do_and_costs_no_order(running, service):
