@@ -60,11 +60,13 @@ class Gaps:
     """The gaps of a map, one row each.
 
     `high` and `low` (g,) are rows of the snapshot, `high` nearer to the laser; of a shadow that other passes have seen
-    in part they are points of theirs. `line` (g,) is the scanline in which the jump's upper end was
-    found, `group` (g,) its pass. `across` (g,) is True where the gap
-    lies across the scanlines (along the travel), False along one line. `width_mm` (g,) is the spacing of such gaps
-    beside each other: the ray spacing for gaps across, the line stride for gaps along the line. `lane` (g,) counts
-    them beside each other within a pass: the ray for gaps across, the place of the scanline for gaps along the line.
+    in part they are points of theirs. `line` (g,) is the scanline in which the jump's upper end was found, `group` (g,)
+    its pass. `across` (g,) is True where the gap lies across the scanlines (along the travel), False along one line.
+    `width_mm` (g,) is the spacing of such gaps beside each other: the ray spacing for gaps across, the line stride for
+    gaps along the line. `lane` (g,) counts them beside each other within a pass: the ray for gaps across, the place of
+    the scanline for gaps along the line.
+    `open_side` (g, 3) is the unit way from the straight surface between both ends to the side on which the part ends;
+    NaN where that is not known: all but shadows in maps of several passes.
     """
 
     high: IntArray
@@ -75,10 +77,11 @@ class Gaps:
     width_mm: Float64Array
     kind: UInt8Array
     lane: IntArray
+    open_side: Float64Array
 
     def __post_init__(self) -> None:
-        for array in (self.high, self.low, self.line, self.group, self.across, self.width_mm, self.kind, self.lane):
-            read_only(array)
+        for name in self.__slots__:
+            read_only(getattr(self, name))
 
     def __len__(self) -> int:
         return len(self.high)
@@ -192,6 +195,7 @@ def gaps_between(
         width_mm=np.concatenate(width),
         kind=np.concatenate(kind),
         lane=np.concatenate(lane),
+        open_side=np.full((len(high), 3), np.nan),
     )
 
 

@@ -38,7 +38,7 @@ from scanner_service.rescan.requirement import Requirement
 from scanner_service.rescan.rungs import settled_kinds
 from scanner_service.rescan.stations import IntArray, Stations, stations_of
 from scanner_service.rescan.strips import Strips, strips_of
-from scanner_service.rescan.unseen import AIR, left_by_others, windows_of
+from scanner_service.rescan.unseen import AIR, left_by_others, nearer_first, open_sides, windows_of
 
 _HOPS = 2  # a point is judged by the lines beside it, and these by those beside them
 _SHIFT = 2  # pairs on either side whose jumps tell the kind of a pair
@@ -249,8 +249,12 @@ class PointVerdicts:
         kind, high, low = gaps.kind.copy(), gaps.high.copy(), gaps.low.copy()
         filled = left[rows, 0] < 0
         kind[rows[filled]] = np.where(left[rows[filled], 0] == AIR, GapKind.HOLE, GapKind.FILLED)
-        high[rows[~filled]], low[rows[~filled]] = left[rows[~filled]].T
-        return replace(gaps, kind=kind, high=high, low=low)
+        rows = rows[~filled]
+        ends = nearer_first(snapshot, gaps, rows, left[rows])
+        high[rows], low[rows] = ends.T
+        open_side = np.full((len(gaps), 3), np.nan)
+        open_side[rows] = open_sides(snapshot, frames, gaps, rows, left[rows])
+        return replace(gaps, kind=kind, high=high, low=low, open_side=open_side)
 
     def _judge(self, snapshot: MapSnapshot, stations: Stations, frames: Frames, lines_judged: BoolArray) -> IntArray:
         """Judge the points of some lines anew; their rows."""

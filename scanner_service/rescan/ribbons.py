@@ -28,6 +28,8 @@ _COVERED = 3.0  # rungs within this many lane widths of a ribbon's rim show the 
 _SAME_SIDE = 0.05  # cosine between a wall's normal and the way its other rungs go down
 _ALONG = (0.25, 0.5, 0.75)  # of a rung: where it is asked whether it lies on a ribbon
 _BULGE = 0.25  # of a rung's length: so far apart ribbons of two passes over one hidden surface may lie
+_BESIDE = 2.0  # ... and, along the rim, so many lanes
+_SAME_OPEN = 0.6  # cosine: ... and they are open to one side
 _JOINED = 3.0  # ends of chains within this many lane widths belong together
 
 
@@ -129,12 +131,12 @@ def _greedy_cover(rungs: Rungs, chains: list[IntArray]) -> tuple[list[IntArray],
             good &= ~(np.einsum("ij,ij->i", facing[first], rungs.aside[second]) < _SAME_SIDE)
             good &= ~_beyond_an_end(rungs, piece, second)
             stands_for[second[good]] = first[good]
-            others, own = _over_the_same(rungs, piece, np.flatnonzero(stands_for < 0))
+            others, own = _over_the_same(rungs, piece, facing, np.flatnonzero(stands_for < 0))
             stands_for[others] = own
     return pieces, stands_for
 
 
-def _over_the_same(rungs: Rungs, piece: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
+def _over_the_same(rungs: Rungs, piece: IntArray, facing: Float64Array, others: IntArray) -> tuple[IntArray, IntArray]:
     """Rungs of other passes that for the most part lie where a piece does, and the rung of it that each lies on."""
     others = others[rungs.family[others] // 2 != rungs.family[piece[0]] // 2]
     if not len(others):
@@ -158,9 +160,12 @@ def _over_the_same(rungs: Rungs, piece: IntArray, others: IntArray) -> tuple[Int
         asked = rungs.top_mm[others] + at * (rungs.bottom_mm - rungs.top_mm)[others]
         away, near = tree.query(asked)
         rung = of_place[near]
-        within = rungs.width_mm[rung] + rungs.grain_mm[rung] + _BULGE * np.fmin(length[rung], length[others])
-        found += away <= within
-        own = np.where(away <= within, rung, own)
+        lane = rungs.width_mm[rung] + rungs.grain_mm[rung]
+        along = np.einsum("ij,ij->i", asked - places[near], np.cross(rungs.ray[rung], facing[rung]))
+        on = (away <= lane + _BULGE * np.fmin(length[rung], length[others])) & (np.abs(along) <= _BESIDE * lane)
+        on &= ~(np.einsum("ij,ij->i", rungs.open_side[rung], rungs.open_side[others]) < _SAME_OPEN)
+        found += on
+        own = np.where(on, rung, own)
     most = 2 * found > len(_ALONG)
     return others[most], own[most]
 

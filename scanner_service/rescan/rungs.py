@@ -36,8 +36,8 @@ class Rungs:
     `top`, `bottom` (m,) are rows of the snapshot, `top_mm`, `bottom_mm` (m, 3) where they are. `lane` (m,) counts
     within `family` (m,), which is one number for each pass and direction. `width_mm` (m,) is the distance between
     lanes, `grain_mm` (m,) that of the points within a lane. `ray` (m, 3) is the unit laser ray at the top, `aside`
-    (m, 3) the unit direction from that ray to the lower end. `of_gap` (g,) is the rung of each of the gaps asked for,
-    `gaps` (g,) their rows.
+    (m, 3) the unit direction from that ray to the lower end, `open_side` (m, 3) that to where the part ends, NaN where
+    it is not known. `of_gap` (g,) is the rung of each of the gaps asked for, `gaps` (g,) their rows.
     """
 
     top: IntArray
@@ -50,6 +50,7 @@ class Rungs:
     grain_mm: Float64Array
     ray: Float64Array
     aside: Float64Array
+    open_side: Float64Array
     of_gap: IntArray
     gaps: IntArray
 
@@ -68,7 +69,9 @@ def rungs_of(snapshot: MapSnapshot, strips: Strips, gaps: Gaps, rows: IntArray) 
     high, low = gaps.high[rows], gaps.low[rows]
     if not len(rows):
         nowhere = np.zeros((0, 3))
-        return Rungs(rows, rows, nowhere, nowhere, rows, rows, np.zeros(0), np.zeros(0), nowhere, nowhere, rows, rows)
+        return Rungs(
+            rows, rows, nowhere, nowhere, rows, rows, np.zeros(0), np.zeros(0), nowhere, nowhere, nowhere, rows, rows
+        )
     family = 2 * gaps.group[rows] + gaps.across[rows]
     # a gap whose upper end is the lower end of another in the same lane hangs below it
     lanes = gaps.lane[rows] - gaps.lane[rows].min()
@@ -108,6 +111,7 @@ def rungs_of(snapshot: MapSnapshot, strips: Strips, gaps: Gaps, rows: IntArray) 
         grain_mm=np.where(across, strips.line_spacing_mm[top], strips.nominal_point_spacing_mm[top]),
         ray=ray,
         aside=aside / np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-12),
+        open_side=gaps.open_side[rows][top_gap],
         of_gap=of_gap,
         gaps=rows,
     )

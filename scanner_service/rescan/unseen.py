@@ -4,7 +4,7 @@ A shadow hides surface between its two ends. Cut through it along the rays that 
 that plane from one end to the other, wherever it goes in between. So the points of other passes near the plane are a
 chain from end to end once the surface is seen, whatever the wall and the floor behind the rim look like; until then
 the chain breaks, and its widest step is what is left. Two points belong together when their neighbourhoods touch.
-Points that the gap's own pass has seen, or that lie on the side it looks from, belong to no such chain.
+Points on surface that the gap's own pass has seen, or on the side it looks from, belong to no such chain.
 
 A cut may also meet two bodies, or the two walls of a hole, with nothing between but air. A step is no surface when what
 was measured goes on all around both of its ends, when these look straight at each other, or when rays went through all
@@ -26,7 +26,6 @@ _FACING = 0.7  # cosine: the walls of a hole face each other, and a straight way
 _BORDER = 0.25  # centroid offset, radii: 0.42 where surface ends straight; below, it goes on all around
 _COLUMN_MM = 1.0  # side of the columns that points are found by, or ...
 _MOST_COLUMNS = 2000  # ... so wide that there are at most so many side by side
-_EVERY = 4  # one return of so many in every other line is asked for its ray
 
 _Columns = tuple[Float64Array, IntArray, Float64Array, float, int, int]  # as `cuts` has them
 
@@ -52,33 +51,55 @@ def left_by_others(
 
     Returns
     -------
-    (k, 2) rows of the snapshot, the end nearer to the gap's own laser first. Gaps in whose cut no other pass has a
-    point keep their ends. NOTHING where no step of the chain is wider than two radii (or, of a short gap, three fifths
-    of it), or those that are have no border; AIR where all that have are air.
+    (k, 2) rows of the snapshot, the end first that comes first on the way from the gap's upper end. Gaps in whose cut
+    no other pass has a point keep their ends. NOTHING where no step of the chain is wider than two radii (or, of a
+    short gap, three fifths of it), or those that are have no border; AIR where all that have are air.
     """
     ends = np.stack([gaps.high[rows], gaps.low[rows]], axis=1).astype(np.int64)
     points = points[(snapshot.neighbours[points] > 0) & snapshot.settled[points] & ~snapshot.isolated[points]]
     start, end = snapshot.points_mm[ends[:, 0]], snapshot.points_mm[ends[:, 1]]
-    way, group = _unit(end - start), gaps.group[rows]
-    aside = np.where(gaps.across[rows, None], frames.along[group], np.cross(frames.along[group], frames.axis[group]))
-    normal = _unit(aside - way * np.einsum("ij,ij->i", aside, way)[:, None])
-    towards_seen = np.einsum("ij,ij->i", np.cross(normal, way), _onward(snapshot, gaps, rows))
-    normal = np.where(towards_seen[:, None] > 0, -normal, normal)
+    way, normal, group = _unit(end - start), _normals(snapshot, frames, gaps, rows), gaps.group[rows]
     kept, columns = _in_columns(snapshot, points)
     steps, alone = np.repeat(ends[:, None], STEPS, axis=1), np.zeros(len(rows), dtype=np.bool_)
     find_steps(
-        columns, kept, stations.group[snapshot.line[kept]], ~(snapshot.offset < _BORDER), start, end, way, normal,
-        group, reach_mm, steps, alone,
+        columns, kept, stations.group[snapshot.line[kept]], snapshot.normals[kept], ~(snapshot.offset < _BORDER),
+        start, end, way, normal, group, reach_mm, steps, alone,
     )  # fmt: skip
     gap, place = np.nonzero((steps[:, :, 0] >= 0) & ~alone[:, None])
     middle, half = 0.5 * (start + end)[gap], 0.5 * DETOUR * np.linalg.norm(end - start, axis=1)[gap]
     air = np.zeros((len(rows), STEPS), dtype=np.bool_)
-    air[gap, place] = _is_air(snapshot, points, steps[gap, place], normal[gap], reach_mm[gap], middle, half)
+    air[gap, place] = _is_air(snapshot, kept, columns, steps[gap, place], normal[gap], reach_mm[gap], middle, half)
     is_left: BoolArray = (steps[:, :, 0] >= 0) & ~air
     left = steps[np.arange(len(rows)), is_left.argmax(axis=1)]
     left[~is_left.any(axis=1)] = NOTHING
     left[~is_left.any(axis=1) & air.any(axis=1)] = AIR
-    return _nearer_first(snapshot, np.where(alone[:, None], ends, left), snapshot.lines.laser_mm[gaps.line[rows]])
+    return np.where(alone[:, None], ends, left)
+
+
+def open_sides(snapshot: MapSnapshot, frames: Frames, gaps: Gaps, rows: IntArray, ends: IntArray) -> Float64Array:
+    """(k, 3) unit ways from what is left of gaps `rows`, `ends` as `left_by_others` has them, to where it is open.
+
+    They are perpendicular to the straight way between the ends, within the cut.
+    """
+    way = _unit(snapshot.points_mm[ends[:, 1]] - snapshot.points_mm[ends[:, 0]])
+    return np.cross(way, _normals(snapshot, frames, gaps, rows))
+
+
+def nearer_first(snapshot: MapSnapshot, gaps: Gaps, rows: IntArray, ends: IntArray) -> IntArray:
+    """The ends (k, 2) of what is left of gaps `rows`, the one nearer to the gap's laser first."""
+    lasers = snapshot.lines.laser_mm[gaps.line[rows]]
+    away = np.linalg.norm(snapshot.points_mm[ends] - lasers[:, None], axis=2)
+    return np.where((away[:, 0] > away[:, 1])[:, None], ends[:, ::-1], ends)
+
+
+def _normals(snapshot: MapSnapshot, frames: Frames, gaps: Gaps, rows: IntArray) -> Float64Array:
+    """(k, 3) unit normals of the cuts, such that what a gap hides lies along normal x way from its upper end."""
+    way = _unit(snapshot.points_mm[gaps.low[rows]] - snapshot.points_mm[gaps.high[rows]])
+    along, axis = frames.along[gaps.group[rows]], frames.axis[gaps.group[rows]]
+    aside = np.where(gaps.across[rows, None], along, np.cross(along, axis))
+    normal = _unit(aside - way * np.einsum("ij,ij->i", aside, way)[:, None])
+    towards_seen = np.einsum("ij,ij->i", np.cross(normal, way), _onward(snapshot, gaps, rows))
+    return np.where(towards_seen[:, None] > 0, -normal, normal)
 
 
 def _onward(snapshot: MapSnapshot, gaps: Gaps, rows: IntArray) -> Float64Array:
@@ -90,27 +111,18 @@ def _onward(snapshot: MapSnapshot, gaps: Gaps, rows: IntArray) -> Float64Array:
 
 
 def _is_air(
-    snapshot: MapSnapshot, points: IntArray, steps: IntArray, normal: Float64Array, reach_mm: Float64Array,
-    middle_mm: Float64Array, half_mm: Float64Array,
+    snapshot: MapSnapshot, kept: IntArray, columns: _Columns, steps: IntArray, normal: Float64Array,
+    reach_mm: Float64Array, middle_mm: Float64Array, half_mm: Float64Array,
 ) -> BoolArray:  # fmt: skip
-    """(k,) True for steps, rows (k, 2), whose ends look straight at each other, or that rays to some points cross."""
+    """(k,) True for steps, rows (k, 2), whose ends look straight at each other, or that rays to points `kept` cross."""
     first, last = snapshot.points_mm[steps[:, 0]], snapshot.points_mm[steps[:, 1]]
     way = _unit(last - first)
     facing = np.einsum("ij,ij->i", way, snapshot.normals[steps[:, 0]]) > _FACING
     facing &= np.einsum("ij,ij->i", way, snapshot.normals[steps[:, 1]]) < -_FACING
-    some = (snapshot.index[points] % _EVERY == 0) & (snapshot.lines.line_index[snapshot.line[points]] % 2 == 0)
-    kept, columns = _in_columns(snapshot, points[some])
     crossed = np.zeros(len(steps), dtype=np.bool_)
-    lasers = snapshot.lines.laser_mm[snapshot.line[kept]]
-    find_crossed(columns, lasers, first, last, normal, reach_mm, middle_mm, half_mm, crossed)
+    lines, lasers = snapshot.line[kept], snapshot.lines.laser_mm.copy()  # the lines' own may not be written to
+    find_crossed(columns, lines, lasers, first, last, normal, reach_mm, middle_mm, half_mm, crossed)
     return np.asarray(facing | crossed)
-
-
-def _nearer_first(snapshot: MapSnapshot, ends: IntArray, laser_mm: Float64Array) -> IntArray:
-    """The ends (k, 2), the one nearer to a laser (k, 3) first; those that are no rows as they are."""
-    away = np.linalg.norm(snapshot.points_mm[ends] - laser_mm[:, None], axis=2)
-    turned = (ends[:, 0] >= 0) & (away[:, 0] > away[:, 1])
-    return np.asarray(np.where(turned[:, None], ends[:, ::-1], ends), dtype=np.int64)
 
 
 def _in_columns(snapshot: MapSnapshot, points: IntArray) -> tuple[IntArray, _Columns]:
