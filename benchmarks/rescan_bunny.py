@@ -1,10 +1,11 @@
 """Visibility proved on real scans: from one range scan of the bunny, what scans from two other sides would see.
 
 The scans' own poses are used (Stanford's bun.conf). The scanner's camera is not known, so the laser's line of sight
-alone is predicted.
+alone is predicted. And what is observed of the scans put together is held against the merged surface.
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,16 @@ from scipy.spatial import cKDTree
 from drivers.scanline import Float64Array, Pose, SensorGeometry
 from scanner_service.analysis.intake import quantise
 from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.rescan.coverage import observed_coverage
+from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.gain import prospect_of
 from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.needs import Needs
 from scanner_service.rescan.passes.optics import ScannerOptics
-from scanner_service.storage.formats.opening import open_recording
+from scanner_service.rescan.regions import find_regions
+from scanner_service.rescan.requirement import Requirement
+from scanner_service.storage.formats.opening import open_cloud, open_recording
 from scanner_service.storage.formats.recording import ReadOptions
 
 LASER_MM = (178.0, 1330.0)  # y and z of the laser in the scan's own frame; its x goes along
@@ -93,6 +98,41 @@ def compare(folder: Path, max_incidence_rad: float = np.radians(65.0)) -> dict[s
     return found
 
 
+def together(folder: Path, density_per_mm2: float = 0.6) -> dict[str, dict[str, float]]:
+    """After each of the scans, as passes of one map: how much of the merged surface has a point near, and what is told.
+
+    Far from all points lies also what no gap shows: the underside, and the back until its scan is there.
+    """
+    merged = open_cloud(folder / "bun_zipper.ply", ReadOptions(units="m")).points_mm
+    poses, live_map, points = poses_of(folder / "bun.conf"), LiveMap(MapSettings(noise_mm=0.1)), []
+    found = {}
+    for number, name in enumerate(("bun000.ply", "bun045.ply", "bun180.ply")):
+        pose = poses[name]
+        for line in open_recording(folder / name, ReadOptions(units="m")).lines:
+            placed = replace(
+                line,
+                pass_index=number,
+                points_mm=pose.apply(line.points_mm),
+                laser_mm=pose.apply(line.laser_mm[None])[0],
+                plane_normal=pose.rotate(line.plane_normal[None])[0],
+                travel=pose.rotate(line.travel[None])[0],
+            )
+            live_map.add(quantise(placed, live_map.origin_mm))
+            points.append(placed.points_mm[np.isfinite(placed.points_mm).all(axis=1)])
+        live_map.close_all_passes()
+        snapshot = live_map.snapshot()
+        report = find_regions(snapshot, Requirement(density_per_mm2=density_per_mm2))
+        shadows = [region for region in report.regions if region.reason is Reason.SHADOW]
+        found[name] = {
+            "true_share": float(np.mean(cKDTree(np.concatenate(points)).query(merged)[0] <= NEAR_MM)),
+            "observed_share": observed_coverage(snapshot, report).share,
+            "shadows": float(len(shadows)),
+            "shadows_mm2": float(sum(region.area_mm2 for region in shadows)),
+        }
+    return found
+
+
 if __name__ == "__main__":
-    for scan, figures in compare(Path(sys.argv[1])).items():
-        print(scan, figures)
+    for examine in (compare, together):
+        for scan, figures in examine(Path(sys.argv[1])).items():
+            print(examine.__name__, scan, figures)
