@@ -83,36 +83,36 @@ def triangulated(
     middle = float(x.mean())
     camera_y = standoff_mm * np.tan(np.radians(camera_deg))
     top, bottom = 25.0, -25.0
-    for number, station in enumerate(y):
-        z = np.full(len(x), np.nan)
-        open_ray = np.ones(len(x), dtype=bool)
-        levels = np.arange(top, bottom, -0.05)
-        above = np.full(len(x), top)
-        for level in levels:
-            at = middle + (x - middle) * (standoff_mm - level) / standoff_mm
-            under = np.nan_to_num(height(at, np.full_like(x, station)), nan=-np.inf) >= level
-            z[open_ray & under] = level
-            open_ray &= ~under
-            above[open_ray] = level
-        for _ in range(30):  # bisection to the crossing
-            half = 0.5 * (above + z)
-            at = middle + (x - middle) * (standoff_mm - half) / standoff_mm
-            under = np.nan_to_num(height(at, np.full_like(x, station)), nan=-np.inf) >= half
-            z, above = np.where(under, half, z), np.where(under, above, half)
-        px = middle + (x - middle) * (standoff_mm - z) / standoff_mm
-        seen = np.isfinite(z) & (z >= -thickness_mm)
-        for share in np.linspace(0.0, 0.2, 250)[1:]:
-            qx, qy = px + share * (middle - px), station + share * camera_y
-            qz = z + share * (standoff_mm - z)
-            seen &= ~(np.nan_to_num(height(qx, np.full_like(x, qy)), nan=-np.inf) > qz + 1e-6)
-        z = z + noise_mm * rng.standard_normal(len(x))
-        seen &= (z >= range_mm[0]) & (z <= range_mm[1])
-        scan.points.append(np.column_stack([px, np.full_like(x, station), z])[seen])
-        scan.index.append(np.flatnonzero(seen))
+    fan, station = np.tile(x - middle, len(y)), np.repeat(y.astype(float), len(x))  # (lines * places,) each
+    z, above = np.full(len(fan), np.nan), np.full(len(fan), top)
+    is_open = np.arange(len(fan))  # the rays that met nothing yet
+    for level in np.arange(top, bottom, -0.05):
+        at = middle + fan[is_open] * (standoff_mm - level) / standoff_mm
+        under = np.nan_to_num(height(at, station[is_open]), nan=-np.inf) >= level
+        z[is_open[under]] = level
+        is_open = is_open[~under]
+        above[is_open] = level
+    for _ in range(30):  # bisection to the crossing
+        half = 0.5 * (above + z)
+        at = middle + fan * (standoff_mm - half) / standoff_mm
+        under = np.nan_to_num(height(at, station), nan=-np.inf) >= half
+        z, above = np.where(under, half, z), np.where(under, above, half)
+    px = middle + fan * (standoff_mm - z) / standoff_mm
+    seen = np.isfinite(z) & (z >= -thickness_mm)
+    for share in np.linspace(0.0, 0.2, 250)[1:]:
+        qx, qy = px + share * (middle - px), station + share * camera_y
+        qz = z + share * (standoff_mm - z)
+        seen &= ~(np.nan_to_num(height(qx, qy), nan=-np.inf) > qz + 1e-6)
+    z = z + noise_mm * rng.standard_normal(len(fan))
+    seen &= (z >= range_mm[0]) & (z <= range_mm[1])
+    by_line = (np.column_stack([px, station, z]).reshape(len(y), len(x), 3), seen.reshape(len(y), len(x)))
+    for number, (line, line_seen) in enumerate(zip(*by_line, strict=True)):
+        scan.points.append(line[line_seen])
+        scan.index.append(np.flatnonzero(line_seen))
         scan.line_index.append(number)
         scan.pass_number.append(pass_number)
-        scan.position.append(float(station))
-        scan.laser.append(np.array([middle, float(station), standoff_mm]))
+        scan.position.append(float(y[number]))
+        scan.laser.append(np.array([middle, float(y[number]), standoff_mm]))
         scan.spacing.append(spacing_mm)
     return scan
 
@@ -139,30 +139,31 @@ def snapshot_of(
     radius = (np.sqrt(2.0) * spacing + 0.1)[line]
     laser = np.array(scan.laser).reshape(-1, 3) @ rotation.T + np.asarray(shift_mm)
     near = cKDTree(points).query_ball_point(points, radius * (1 + 1e-12)) if n else []
-    neighbours = np.zeros(n, np.int32)
+    neighbours = np.array([len(rows) for rows in near], np.int32)
     normals = np.full((n, 3), np.nan)
     unreliable = np.zeros(n, np.uint8)
     offset, residual, error = np.zeros(n), np.full(n, np.nan), np.full(n, np.nan)
-    for i, rows in enumerate(near):
+    for count_near in np.unique(neighbours).tolist():  # all points with as many neighbours at once
+        i = np.flatnonzero(neighbours == count_near)
+        rows = np.stack([near[k] for k in i])
         found = points[rows]
-        neighbours[i] = np_i = len(rows)
-        mean = found.mean(axis=0)
-        offset[i] = np.linalg.norm(mean - points[i]) / radius[i]
-        if np_i < 6:
+        mean = found.mean(axis=1)
+        offset[i] = np.linalg.norm(mean - points[i], axis=1) / radius[i]
+        if count_near < 6:
             unreliable[i] = Unreliable.TOO_FEW
-        lines_near, per_line = np.unique(line[rows], return_counts=True)
-        if not unreliable[i] and len(lines_near) < 3 and (per_line >= 2).sum() < 2:
-            unreliable[i] = Unreliable.SINGLE_LINE
-        if np_i < 4:
+        same = np.diff(np.sort(line[rows], axis=1), axis=1) == 0
+        again = same & ~np.pad(same, ((0, 0), (1, 0)))[:, :-1]  # a line's second point
+        lines_near, lines_with_two = count_near - same.sum(axis=1), again.sum(axis=1)
+        unreliable[i[(unreliable[i] == 0) & (lines_near < 3) & (lines_with_two < 2)]] = Unreliable.SINGLE_LINE
+        if count_near < 4:
             continue
-        _, s, axes = np.linalg.svd(found - mean, full_matrices=False)
-        residual[i] = s[2] / np.sqrt(np_i - 3)
-        sigma = max(noise_mm, residual[i])
-        error[i] = sigma / max(s[1], 1e-12)
-        if not unreliable[i] and error[i] > np.radians(5.0):
-            unreliable[i] = Unreliable.ILL_DETERMINED
-        if not unreliable[i]:
-            normals[i] = axes[2] * (1.0 if axes[2] @ (laser[line[i]] - points[i]) >= 0 else -1.0)
+        _, s, axes = np.linalg.svd(found - mean[:, None], full_matrices=False)
+        residual[i] = s[:, 2] / np.sqrt(count_near - 3)
+        error[i] = np.maximum(noise_mm, residual[i]) / np.maximum(s[:, 1], 1e-12)
+        unreliable[i[(unreliable[i] == 0) & (error[i] > np.radians(5.0))]] = Unreliable.ILL_DETERMINED
+        up = np.where(np.sum(axes[:, 2] * (laser[line[i]] - points[i]), axis=1) >= 0, 1.0, -1.0)
+        good = unreliable[i] == 0
+        normals[i[good]] = (axes[:, 2] * up[:, None])[good]
     point_spacing = np.array(
         [np.median(np.linalg.norm(np.diff(p, axis=0), axis=1)) if len(p) > 1 else np.nan for p in scan.points]
     )
