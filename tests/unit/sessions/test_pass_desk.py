@@ -29,9 +29,17 @@ from scanner_service.sessions.rig_setups import RigSetup
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
 from scanner_service.storage.record import Record
-from simulators.parts import step
 from simulators.posed_rig import PosedScanner
-from tests.unit.rescan.passes.posed_scans import DENSITY, FROM_ABOVE, OPTICS, SCANNER, free_reach, linear_reach
+from tests.unit.rescan.passes.posed_scans import (
+    ALONG_SMALL_STEP,
+    DENSITY,
+    FROM_ABOVE,
+    OPTICS,
+    SCANNER,
+    SMALL_STEP,
+    free_reach,
+    linear_reach,
+)
 from tests.unit.rescan.passes.test_serving import box_corners
 
 
@@ -49,9 +57,9 @@ def scanned(book):
     session = book.create(
         "step", PushSpec(), SessionSettings(target=Requirement(density_per_mm2=DENSITY), max_points=400_000)
     )
-    posed = PosedScanner(SCANNER, step().surface, np.random.default_rng(1))
+    posed = PosedScanner(SCANNER, SMALL_STEP, np.random.default_rng(1))
     session.start()
-    push(session, posed, FROM_ABOVE, -1.0, 41.0, 0.6)
+    push(session, posed, FROM_ABOVE, *ALONG_SMALL_STEP, 0.6)
     session.stop()
     return session, posed
 
@@ -263,7 +271,7 @@ def test_a_session_between_two_passes_is_not_closed_to_make_room(book, scanned, 
     desk.describe_rig(RigSetup(free_reach(30.0), OPTICS))
     order = desk.accept(1)
     desk.carry_out(order.order_id)
-    push(session, posed, FROM_ABOVE, -1.0, 1.0, 1.0)
+    push(session, posed, FROM_ABOVE, 9.0, 12.0, 1.0)
     begun, may_judge = threading.Event(), threading.Event()
     fresh_results = session.fresh_results
 

@@ -15,12 +15,17 @@ from scanner_service.rescan.regions import find_regions
 from scanner_service.rescan.requirement import Requirement
 from simulators.optics import demo_scanner
 from simulators.posed_rig import PosedScanner
+from simulators.shapes import Union, box
 
 DENSITY = 20.0
 SCANNER = demo_scanner()
 OPTICS = ScannerOptics(SCANNER.geometry(), SCANNER.field_of_view_mm, SCANNER.points_per_line)
 ASKED = Requirement(density_per_mm2=DENSITY)
 FROM_ABOVE = StraightMotion(Pose.identity(), np.array([0.0, 1.0, 0.0]))
+SMALL_STEP = Union(box((-10.0, 10.0, -6.0), (10.0, 30.0, 0.0)), box((-10.0, 20.0, -6.0), (10.0, 30.0, 5.0)))
+"""The step of the simulator's parts, 20 mm x 20 mm of it: a quarter of the points, and of the time to plan."""
+
+ALONG_SMALL_STEP = (9.0, 31.0)
 
 
 class Bench:
