@@ -10,10 +10,10 @@ from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.requirement import Requirement
-from simulators.parts import plate
-from simulators.shapes import Sphere
+from simulators.shapes import Sphere, box
 from tests.unit.rescan.passes.posed_scans import DENSITY, FROM_ABOVE, OPTICS, SCANNER, Bench, free_reach, linear_reach
 
+PLATE, AREA_MM2 = box((-10.0, 10.0, -6.0), (10.0, 30.0, 0.0)), 20.0 * 20.0
 CHORD_MM = 0.002
 SPARSE = 2.0  # points/mm2 that any of these scans has
 RADIUS_MM = 12.0
@@ -29,9 +29,9 @@ def failing_share(judged):
 def test_curved_places_ask_for_lines_as_close_as_the_chord_error_allows_and_flat_ones_do_not():
     chord = Requirement(density_per_mm2=SPARSE, chord_error_mm=CHORD_MM)
     wishes = Wishes(SPARSE, max_passes=1, explore=False, requirement=chord)
-    flat = Bench(plate().surface).scan(FROM_ABOVE, -1.0, 41.0, 0.6)
+    flat = Bench(PLATE).scan(FROM_ABOVE, 9.0, 31.0, 0.6)
     asked = sum(one.gain_mm2 for one in plan_passes(*flat.judged(chord), linear_reach(), OPTICS, wishes).passes)
-    assert asked < 0.02 * 40.0 * 40.0
+    assert asked < 0.02 * AREA_MM2
 
     ball = Bench(Sphere((0.0, 15.0, 0.0), RADIUS_MM)).scan(FROM_ABOVE, 2.0, 28.0, 0.6)
     before = ball.judged(chord)
@@ -47,21 +47,21 @@ def test_a_noisy_place_is_looked_at_from_nearer_to_its_normal_and_until_good_poi
     cosine, sine = math.cos(TILT_RAD), math.sin(TILT_RAD)
     turn = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
     aslant = StraightMotion(Pose(turn, np.zeros(3)), np.array([0.0, 1.0, 0.0]))
-    bench = Bench(plate().surface)
+    bench = Bench(PLATE)
     clean = bench.posed.scanner
     bench.posed.scanner = dataclasses.replace(clean, noise_mm=12.0 * SCANNER.noise_mm)
-    bench.scan(aslant, -1.0, 41.0, 0.3)
+    bench.scan(aslant, 9.0, 31.0, 0.3)
     before = bench.judged(quiet)
     noisy = before[1].reason == Reason.NOISY
     assert noisy.mean() > 0.5
     wishes = Wishes(SPARSE, max_passes=1, explore=False, requirement=quiet)
     one = plan_passes(*before, free_reach(), OPTICS, wishes).passes[0]
     assert all(promise.largest_incidence_rad <= 0.75 * TILT_RAD for promise in one.promises)
-    old = len(before[0]) / (40.0 * 40.0)
+    old = len(before[0]) / (AREA_MM2)
     assert all(promise.density_per_mm2 > old for promise in one.promises)
     bench.posed.scanner = clean
     bench.scan(one.motion, one.start_mm, one.end_mm, one.line_spacing_mm)
-    assert one.gain_mm2 > 0.5 * 40.0 * 40.0
+    assert one.gain_mm2 > 0.5 * AREA_MM2
     snapshot, report = bench.judged(quiet)
     new = report.judgement.fails[snapshot.lines.pass_number[snapshot.line] == 1]
     assert new.mean() < 0.05
@@ -72,7 +72,7 @@ def test_when_nothing_else_is_left_steep_surface_is_asked_for_what_it_lacks_from
     cosine, sine = math.cos(STEEP_RAD), math.sin(STEEP_RAD)
     turn = np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])  # the camera's side is turned down
     aslant = StraightMotion(Pose(turn, np.array([0.0, 20.0, 0.0])), turn[:, 1].copy())
-    bench = Bench(plate().surface).scan(aslant, -9.0, 9.0, 0.25)
+    bench = Bench(PLATE).scan(aslant, -9.0, 9.0, 0.25)
     before = bench.judged()
     assert (before[1].reason == Reason.STEEP).mean() > 0.5
     only_so = dataclasses.replace(free_reach(max_tilt_deg=2.0), up=aslant.at_zero.rotation[:, 2].copy())
