@@ -7,6 +7,9 @@ BIN := $(VENV)/bin
 ARGS ?=
 WORKERS ?= 3
 
+# Whatever the environment says: each service and simulator that a test starts would compile hundreds of files again.
+export PYTHONDONTWRITEBYTECODE =
+
 .PHONY: demo test test-long faults fuzz lint bench clean
 .DELETE_ON_ERROR:
 

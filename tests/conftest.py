@@ -1,5 +1,7 @@
 """What holds for every test: laws are judged by what they say, and a run of all of them wastes no core."""
 
+import contextlib
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -36,8 +38,21 @@ def _is_controller(config: pytest.Config) -> bool:
     return bool(getattr(config.option, "numprocesses", None)) and not hasattr(config, "workerinput")
 
 
+def _import_others_first(worker: int, workers: int, wanted: list[str]) -> None:
+    """Workers begin with different files, so that pytest rewrites the assertions of each file once and not in each."""
+    paths = [Path(each.partition("::")[0]).resolve() for each in wanted]
+    files = sorted({file for path in paths for file in ([path] if path.is_file() else path.rglob("test_*.py"))})
+    begin = len(files) * worker // workers
+    for file in files[begin:] + files[:begin]:
+        with contextlib.suppress(Exception, pytest.skip.Exception):  # whatever it is, collecting meets and tells it
+            importlib.import_module(".".join(file.relative_to(TESTS.parent).with_suffix("").parts))
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Kernels are compiled once, beside the first tests, and not by each worker and each service for itself."""
+    if hasattr(session.config, "workerinput"):
+        mine = session.config.workerinput
+        _import_others_first(int(mine["workerid"][2:]), mine["workercount"], session.config.args)
     if _is_controller(session.config) and not session.config.option.collectonly:
         _compiling.append(subprocess.Popen([sys.executable, "-c", COMPILE], cwd=TESTS.parent))
 

@@ -7,7 +7,7 @@ import httpx
 import typer
 
 from scanner_service.api.keys import read_local_key
-from scanner_service.commands.serve import DEFAULT_DATA, Data
+from scanner_service.commands.data_folder import DEFAULT_DATA, Data
 from scanner_service.commands.terminal import console, fail, plain_errors, show_json
 
 

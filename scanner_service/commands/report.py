@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
+from scanner_service.commands.data_folder import DEFAULT_DATA
 from scanner_service.commands.options import Data, RecordFile, meshes_in, open_reader
-from scanner_service.commands.serve import DEFAULT_DATA
 from scanner_service.commands.terminal import check_folder, console, errors, plain_errors, show_json, work_progress
 from scanner_service.sessions.exporting import REPORT, REPORT_FILES, export_session
 from scanner_service.sessions.stored import find_session

@@ -8,7 +8,7 @@ import httpx
 import typer
 from rich.table import Table
 
-from scanner_service.commands.serve import DEFAULT_DATA, Data
+from scanner_service.commands.data_folder import DEFAULT_DATA, Data
 from scanner_service.commands.sessions import named, running_service
 from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json, waiting_for
 

@@ -11,16 +11,14 @@ from scanner_service.api.login import login_url
 from scanner_service.api.origins import Allowlist
 from scanner_service.api.server import Listening, Tls, serve
 from scanner_service.api.service import Service
+from scanner_service.commands.data_folder import DEFAULT_DATA, Data
 from scanner_service.commands.terminal import errors, plain_errors
 from scanner_service.sessions.retention import Retention
 from scanner_service.storage.rows import Limits
 
-DATA_HELP = "Folder of the record, the keys and the replay files."
-Data = Annotated[Path, typer.Option("--data", envvar="SCANNER_DATA", help=DATA_HELP)]
 RECORD_HELP = (
     "Where the record is kept: a file, or postgresql://user@host/database; a file in the data folder by default."
 )
-DEFAULT_DATA = Path.home() / ".local" / "share" / "scanner-service"
 
 
 def serve_command(

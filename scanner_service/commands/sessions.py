@@ -13,10 +13,10 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from scanner_service.api.keys import read_local_key
-from scanner_service.commands.serve import DEFAULT_DATA, Data
+from scanner_service.commands.data_folder import DEFAULT_DATA, Data
 from scanner_service.commands.terminal import console, errors, fail, plain_errors, show_json, tell_regions
 from scanner_service.commands.until_ready import wait_until_ready
-from scanner_service.sessions.stored import named_session
+from scanner_service.sessions.named import named_session
 
 _ASKED = {
     "density_per_mm2": "{:g} points/mm²",

@@ -19,8 +19,6 @@ from scanner_service.storage.exports.manifest import write_manifest
 from scanner_service.storage.exports.point_files import POINT_FORMATS
 from scanner_service.storage.exports.point_stream import PointStream, stream_of
 from scanner_service.storage.exports.record_file import write_session_record
-from scanner_service.storage.exports.report_html import report_html
-from scanner_service.storage.exports.report_pdf import report_pdf
 from scanner_service.storage.exports.whole_file import write_whole
 from scanner_service.storage.reader import RecordReader
 from scanner_service.storage.rows import SessionRow
@@ -153,6 +151,9 @@ def _write_record(reader: RecordReader, row: SessionRow, folder: Path, on_progre
 
 
 def _write_report(stored: StoredSession, folder: Path, now: datetime, on_progress: OnProgress) -> list[str]:
+    from scanner_service.storage.exports.report_html import report_html  # noqa: PLC0415 - 0.4 s for who draws nothing
+    from scanner_service.storage.exports.report_pdf import report_pdf  # noqa: PLC0415
+
     content = report_of(stored, now)
     for done, (file_name, write) in enumerate(zip(REPORT_FILES, (report_html, report_pdf), strict=True)):
         on_progress(REPORT, done / len(REPORT_FILES))

@@ -12,7 +12,6 @@ from scanner_service.sessions.results import Results, summarise
 from scanner_service.sessions.session import LiveSession
 from scanner_service.sessions.stored import StoredSession
 from scanner_service.sessions.withdrawals import end_of_scan_utc
-from scanner_service.storage.exports.density_png import density_png
 from scanner_service.storage.exports.points_ply import write_points_ply
 from scanner_service.storage.exports.results_json import write_json
 from scanner_service.storage.exports.whole_file import write_whole
@@ -59,6 +58,8 @@ def _points(path: Path, outcome: Outcome) -> None:
 
 
 def _density(path: Path, outcome: Outcome) -> None:
+    from scanner_service.storage.exports.density_png import density_png  # noqa: PLC0415 - 0.4 s for who draws nothing
+
     picture = density_png(
         outcome.results.snapshot,
         outcome.results.regions,

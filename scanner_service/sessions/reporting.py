@@ -12,7 +12,7 @@ from scanner_service.sessions.fingerprint import verdict_sha256
 from scanner_service.sessions.results import Results, summarise
 from scanner_service.sessions.stored import Stage, StoredSession
 from scanner_service.sessions.wires import joined
-from scanner_service.storage.exports.density_png import letters_of
+from scanner_service.storage.exports.letters import letters_of
 from scanner_service.storage.exports.report_content import (
     FateRow,
     PassRow,

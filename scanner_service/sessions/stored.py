@@ -13,10 +13,10 @@ from scanner_service.analysis.passes import PassKey, pass_key
 from scanner_service.analysis.snapshot import MapSnapshot, Unreliable
 from scanner_service.rescan.followed import RegionBook
 from scanner_service.sessions.calibration import calibration_after, geometry_from, towards_sensor_from
-from scanner_service.sessions.errors import SourceUnusable
 from scanner_service.sessions.fingerprint import RawHash
 from scanner_service.sessions.ledger import Ledger
 from scanner_service.sessions.left_regions import last_left
+from scanner_service.sessions.named import named_session
 from scanner_service.sessions.references import nominal_of
 from scanner_service.sessions.results import Results, judge
 from scanner_service.sessions.settings import SessionSettings
@@ -92,30 +92,6 @@ def find_session(reader: RecordReader, wanted: str) -> SessionRow:
             after = page[-1].session_id
 
     return reader.get_session(named_session((row.session_id for row in rows()), wanted))
-
-
-def named_session(newest_first: Iterable[str], wanted: str) -> str:
-    """Which of the ids is meant: that id, the only one that begins so, or the newest for `latest`.
-
-    Raises
-    ------
-    SourceUnusable : none, or several; the sentence says which there are.
-    """
-    begun, seen = [], 0
-    for session_id in newest_first:
-        if wanted in ("latest", session_id):
-            return session_id
-        seen += 1
-        begun += [session_id] if session_id.lower().startswith(wanted.lower()) else []
-    if len(begun) == 1:
-        return begun[0]
-    if begun:
-        raise SourceUnusable(f"{len(begun)} sessions begin with {wanted}: {', '.join(begun[:5])}; give more letters")
-    raise SourceUnusable(
-        f"the record holds no session {wanted}; it holds {seen}, of which `latest` is the newest"
-        if seen
-        else "the record holds no session"
-    )
 
 
 def lines_of(

@@ -7,9 +7,9 @@ import pytest
 from tests.end_to_end.running import RunningService, RunningSimulator
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def shared_service(tmp_path_factory):
-    """One service for a file."""
+    """One service for all files of a worker."""
     shared = RunningService(tmp_path_factory.mktemp("shared") / "data")
     yield shared
     shared.end()
@@ -38,7 +38,7 @@ def running(tmp_path):
 
 @pytest.fixture
 def service(running, shared_service):
-    """The service of the file, for tests that neither end it nor mind the sessions of others.
+    """The service of the worker, for tests that neither end it nor mind the sessions of others.
 
     What a test leaves is stopped while its simulator still runs: a session that looked for a terminal which is gone
     would open the next one of that number, which may be another test's.

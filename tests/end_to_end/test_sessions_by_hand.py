@@ -19,7 +19,7 @@ from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import PushSpec
 from scanner_service.storage.record import Record
-from tests.end_to_end.running import RunningService, wait_for
+from tests.end_to_end.running import RunningService, RunningSimulator, wait_for
 from tests.end_to_end.test_live_scan import device, live_client, read_ply
 from tests.unit.analysis.scans import surface_scan
 
@@ -90,42 +90,6 @@ def test_after_an_interruption_longer_than_the_dead_man_the_laser_stays_off_unti
     assert len(status["losses"]["passes"]) == 2
     kinds = [event["kind"] for event in service.client.get(f"/api/v1/sessions/{session_id}/events").json()["events"]]
     assert [kind for kind in kinds if kind in ("interrupted", "held", "resumed")] == ["interrupted", "held", "resumed"]
-
-
-def test_a_killed_scan_is_reopened_with_its_ledger_its_notes_and_the_same_verdict(running):
-    service, simulator = running.service(), running.simulator("step")
-    session_id = service.create(**device(simulator, end_mm=simulator.ready["travel_mm"][1]))
-    service.client.patch(f"/api/v1/sessions/{session_id}", json={"notes": "fixture 7", "name": "step"})
-    service.start(session_id)
-    over = service.wait_for_state(session_id, "stopped")
-    regions = service.client.get(f"/api/v1/sessions/{session_id}/regions").json()["regions"]
-    other = running.simulator("plate")
-    killed_id = service.create(**device(other))
-    service.start(killed_id)
-    wait_for(lambda: (service.status(killed_id)["losses"]["passes"] or [{"lines": {"stored": 0}}])[0]["lines"]["stored"]
-             > 20, "some lines")  # fmt: skip
-    wait_for(lambda: service.kept_account(killed_id).get("elapsed_s", 0) > 0, "an account in the record")
-    service.kill()
-
-    service = running.service()
-    told = service.client.post(f"/api/v1/sessions/{session_id}/open")
-    assert told.status_code == 202
-    wait_for(
-        lambda: service.client.get(f"/api/v1/sessions/{session_id}/open").json()["is_open"], "the session to be open"
-    )
-    again = service.status(session_id)
-    assert (again["notes"], again["name"], again["lines"]) == ("fixture 7", "step", over["lines"])
-    assert again["losses"]["passes"] == over["losses"]["passes"]
-    assert again["losses"]["device"] == over["losses"]["device"]
-    assert again["points_per_s"] == pytest.approx(over["points_per_s"], rel=0.2)
-    assert again["calibration"]["scanner"]["device_id"] == "SIM-0001"
-    assert service.client.get(f"/api/v1/sessions/{session_id}/regions").json()["regions"] == regions
-    killed = service.status(killed_id)
-    sent, stored, lost = account_of(killed)
-    assert stored == killed["lines"] > 20
-    assert sent == stored + lost
-    assert killed["points_per_s"] > 0
-    assert service.client.post(f"/api/v1/sessions/{'0' * 14}/open").status_code == 404
 
 
 ONCE, ITS_KEY = {"name": "once", "source": {"kind": "push"}}, {"Idempotency-Key": "7f3a"}
@@ -205,18 +169,64 @@ def withdrawn(service):
     return session, before
 
 
+def scanned_to_the_end_and_half(service, simulators):
+    """A scan that is over and one in its middle, whose account is in the record."""
+
+    def simulated(part):
+        simulator = RunningSimulator(part)
+        simulators.callback(simulator.end)
+        return simulator
+
+    step = simulated("step")
+    whole_id = service.create(**device(step, end_mm=step.ready["travel_mm"][1]))
+    service.client.patch(f"/api/v1/sessions/{whole_id}", json={"notes": "fixture 7", "name": "step"})
+    service.start(whole_id)
+    over = service.wait_for_state(whole_id, "stopped")
+    regions = service.client.get(f"/api/v1/sessions/{whole_id}/regions").json()["regions"]
+    half_id = service.create(**device(simulated("plate")))
+    service.start(half_id)
+    wait_for(lambda: (service.status(half_id)["losses"]["passes"] or [{"lines": {"stored": 0}}])[0]["lines"]["stored"]
+             > 20, "some lines")  # fmt: skip
+    wait_for(lambda: service.kept_account(half_id).get("elapsed_s", 0) > 0, "an account in the record")
+    return whole_id, over, regions, half_id
+
+
 @pytest.fixture(scope="module")
 def restarted(tmp_path_factory):
     """A service that was killed and started again, and what its sessions told before: one restart for several tests."""
     data = tmp_path_factory.mktemp("restarted") / "data"
-    with contextlib.ExitStack() as services:
+    with contextlib.ExitStack() as simulators, contextlib.ExitStack() as services:
         first = RunningService(data)
         services.callback(first.end)
         told = {each.__name__: each(first) for each in (created_twice, withdrawn, pushed_in_two_goes, pushed_at_length)}
+        told["scanned"] = scanned_to_the_end_and_half(first, simulators)
         first.kill()
         again = RunningService(data)
         services.callback(again.end)
         yield again, told
+
+
+def test_a_killed_scan_is_reopened_with_its_ledger_its_notes_and_the_same_verdict(restarted):
+    service, told_before = restarted
+    session_id, over, regions, killed_id = told_before["scanned"]
+    told = service.client.post(f"/api/v1/sessions/{session_id}/open")
+    assert told.status_code == 202
+    wait_for(
+        lambda: service.client.get(f"/api/v1/sessions/{session_id}/open").json()["is_open"], "the session to be open"
+    )
+    again = service.status(session_id)
+    assert (again["notes"], again["name"], again["lines"]) == ("fixture 7", "step", over["lines"])
+    assert again["losses"]["passes"] == over["losses"]["passes"]
+    assert again["losses"]["device"] == over["losses"]["device"]
+    assert again["points_per_s"] == pytest.approx(over["points_per_s"], rel=0.2)
+    assert again["calibration"]["scanner"]["device_id"] == "SIM-0001"
+    assert service.client.get(f"/api/v1/sessions/{session_id}/regions").json()["regions"] == regions
+    killed = service.status(killed_id)
+    sent, stored, lost = account_of(killed)
+    assert stored == killed["lines"] > 20
+    assert sent == stored + lost
+    assert killed["points_per_s"] > 0
+    assert service.client.post(f"/api/v1/sessions/{'0' * 14}/open").status_code == 404
 
 
 def test_a_creation_that_is_sent_again_makes_no_second_session_also_after_a_restart(restarted):

@@ -155,10 +155,10 @@ def assert_coloured_by_density(page: Page, known: dict[str, np.ndarray], x_mm: f
 
 
 def test_the_page_says_that_the_scanner_is_gone_and_stops_the_scan_when_it_is_back(
-    running: Any, context: Any, tmp_path: Path
+    service: Any, running: Any, context: Any, tmp_path: Path
 ) -> None:
     link = tmp_path / "scanner-port"
-    service, simulator = running.service(), running.simulator("step", "--link", link)
+    simulator = running.simulator("step", "--link", link)
     session_id = service.create(**device(simulator, port=str(link), line_rate_hz=6.0, rearm=True))
     service.start(session_id)
     page = viewer_page(context, service)
@@ -299,9 +299,9 @@ def along(order: dict[str, Any]) -> Callable[[float], Pose]:
 
 
 def test_what_is_asked_for_is_set_on_the_page_and_a_hand_is_guided_along_the_pass_that_it_needs(
-    running: Any, context: Any
+    service: Any, context: Any
 ) -> None:
-    service, posed = running.service(), PosedScanner(SCANNER, plate().surface, np.random.default_rng(1))
+    posed = PosedScanner(SCANNER, plate().surface, np.random.default_rng(1))
     session_id = service.create(kind="push")
     service.start(session_id)
     push(service, session_id, posed.scan(FROM_ABOVE.part_from_sensor, 4.0, 12.0, 0.5))

@@ -5,6 +5,7 @@ must stay up and say so; when it is well again everything must go on by itself, 
 """
 
 import random
+import shutil
 import tempfile
 import time
 from collections import Counter
@@ -81,10 +82,13 @@ def every_fault() -> list[Fault]:
 def inject(faults: list[Fault], on_progress: Callable[[Account], None] = lambda account: None) -> Account:
     """Try the faults one after another."""
     account = Account()
-    for fault in faults:
-        with tempfile.TemporaryDirectory(prefix="faults-") as folder:
-            _try(Path(folder) / "r", fault, account)
-        on_progress(account)
+    with tempfile.TemporaryDirectory(prefix="faults-") as first:
+        _prepare(Path(first) / "r")
+        for fault in faults:
+            with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+                shutil.copytree(first, folder, dirs_exist_ok=True)
+                _try(Path(folder) / "r", fault, account)
+            on_progress(account)
     return account
 
 
@@ -165,7 +169,6 @@ def _saying(said: list[tuple[int, Any]], index: int) -> Callable[[Answer[Any]], 
 
 
 def _try(path: Path, fault: Fault, account: Account) -> None:
-    _prepare(path)
     calls: Counter[str] = Counter()
     is_ill, healed_s = True, [0.0]
 

@@ -25,6 +25,7 @@ from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.storage.exports.density_raster import DensityRaster, View, judged, rasterise, view_along
 from scanner_service.storage.exports.density_scale import DensityScale, scale_of
 from scanner_service.storage.exports.label_places import label_places, pointed_at
+from scanner_service.storage.exports.letters import letters_of
 
 Colours = Literal["viridis", "blue-red"]
 
@@ -238,15 +239,6 @@ def _outlines(axes: Axes, regions: Sequence[OutlinedRegion], view: View) -> dict
                 zorder=4 - 0.001 * rank,
             )
     return counts
-
-
-def letters_of(number: int) -> str:
-    """A, B, … Z, AA, AB, … for 1, 2, …; the number as it is below 1."""
-    letters = ""
-    while number > 0:
-        number, last = divmod(number - 1, 26)
-        letters = chr(ord("A") + last) + letters
-    return letters or str(number)
 
 
 def _labels(axes: Axes, regions: Sequence[OutlinedRegion], view: View, name: Callable[[int], str]) -> None:

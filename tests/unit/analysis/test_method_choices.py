@@ -73,7 +73,7 @@ def test_where_walls_are_a_few_spacings_apart_the_default_smooths_nothing_away(s
     assert error < 1.02 * best
 
 
-@pytest.mark.parametrize("shape", ["sphere", "cylinder", "edge"])
+@pytest.mark.parametrize("shape", ["sphere", pytest.param("cylinder", marks=pytest.mark.long), "edge"])
 def test_noise_alone_never_makes_a_cloud_coarse(shape):
     rng = np.random.default_rng(3)
     points = add_noise(SHAPES[shape](2000, rng).points_mm, NoiseLevel("spacing", 1.0), rng)
