@@ -299,9 +299,9 @@ def along(order: dict[str, Any]) -> Callable[[float], Pose]:
 
 
 def test_what_is_asked_for_is_set_on_the_page_and_a_hand_is_guided_along_the_pass_that_it_needs(
-    service: Any, context: Any
+    running: Any, context: Any
 ) -> None:
-    posed = PosedScanner(SCANNER, plate().surface, np.random.default_rng(1))
+    service, posed = running.service(), PosedScanner(SCANNER, plate().surface, np.random.default_rng(1))
     session_id = service.create(kind="push")
     service.start(session_id)
     push(service, session_id, posed.scan(FROM_ABOVE.part_from_sensor, 4.0, 12.0, 0.5))
