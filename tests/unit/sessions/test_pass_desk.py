@@ -67,7 +67,7 @@ def scanned(book):
 def push(session, posed, motion, start_mm, end_mm, spacing_mm):
     replies = [session.push(line) for line in posed.scan(motion.part_from_sensor, start_mm, end_mm, spacing_mm)]
     for reply in replies:
-        reply.result(30)
+        reply.result(300)
 
 
 def kinds(book, session):
@@ -380,12 +380,12 @@ def test_one_pass_is_carried_out_at_a_time(book, scanned):
     def late_verdict():
         if threading.current_thread().name.startswith("pass-"):  # over, and not reckoned up yet
             begun.set()
-            may_judge.wait(30)
+            may_judge.wait(300)
         return fresh_results()
 
     session.fresh_results = late_verdict
     session.stop()
-    assert begun.wait(30) and session.state == "stopped"
+    assert begun.wait(300) and session.state == "stopped"
     with pytest.raises(SessionBusy, match="pass order 1 is being carried out"):
         desk.carry_out(second.order_id)
     assert (first.status, second.status, session.state) == (PassStatus.RUNNING, PassStatus.CANCELLED, "stopped")
