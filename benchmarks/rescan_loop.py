@@ -46,6 +46,7 @@ STILL_PASSES, STILL_SHARE = 8, 0.001
 """Largest hole first ends when so many passes brought less than this share of the surface."""
 LEAST_MM2 = 1.0
 """What promises less promises nothing: a plan recommends no pass that brings less."""
+_ROUNDED_MM2 = 0.05
 LOST = 2.1
 """Other ways are followed until they took this many times as long as the loop in all."""
 MAX_PASSES = 120
@@ -183,7 +184,10 @@ def closed_loop(
         outcome: Outcome = reckon(chosen, was, was_report, snapshot, report, optics)
         tried = tried.and_also(outcome.missed_mm, outcome.empty_mm)
         earlier.append(outcome)
-        for name in ("promised_mm2", "reached_mm2", "expected_mm2", "found_mm2", "besides_mm2"):
+        for name in (
+            "promised_mm2", "reached_mm2", "expected_mm2", "found_mm2", "besides_mm2", "promised_between_mm2",
+            "expected_between_mm2",
+        ):  # fmt: skip
             getattr(scan.run, name).append(getattr(outcome, name))
         scan.run.true_gain_mm2.append(scan.truth.met_mm2 - before)
         tell(_told(scan, chosen, outcome, plan, reach))
@@ -210,27 +214,32 @@ def _ended(run: Run) -> str:
 def promises_of(run: Run) -> dict[str, dict[str, float]]:
     """How far reached was from promised, by the service's own reckoning, and found from expected where it explored.
 
-    `median_error` is the median of |reached - promised| / promised over the passes that promise at least LEAST_MM2.
-    `all` takes what was promised and what was expected together.
+    `median_error` is the median of |reached - promised| / promised over the passes that promise at least LEAST_MM2,
+    `within` the share of them that came within the interval told, and `median_width` how wide that was for what was
+    promised.
     """
-    promised, reached, expected, found = (
-        np.array(one) for one in (run.promised_mm2, run.reached_mm2, run.expected_mm2, run.found_mm2)
-    )
+    said = {
+        "promised": (run.promised_mm2, run.reached_mm2, run.promised_between_mm2),
+        "explored": (run.expected_mm2, run.found_mm2, run.expected_between_mm2),
+    }
     return {
-        "promised": _errors(promised, reached),
-        "explored": _errors(expected, found),
-        "all": _errors(promised + expected, reached + found),
+        name: _errors(np.array(mm2), np.array(came), np.array(between).reshape(-1, 2))
+        for name, (mm2, came, between) in said.items()
     }
 
 
-def _errors(said_mm2: Float64Array, came_mm2: Float64Array) -> dict[str, float]:
+def _errors(said_mm2: Float64Array, came_mm2: Float64Array, between_mm2: Float64Array) -> dict[str, float]:
     counts = said_mm2 >= LEAST_MM2
     error = np.abs(came_mm2[counts] - said_mm2[counts]) / said_mm2[counts]
+    low, high = between_mm2[counts].T
+    within = (came_mm2[counts] >= low - _ROUNDED_MM2) & (came_mm2[counts] <= high + _ROUNDED_MM2)
     return {
         "passes": float(counts.sum()),
         "said_mm2": float(said_mm2.sum()),
         "came_mm2": float(came_mm2.sum()),
         "median_error": float(np.median(error)) if len(error) else math.nan,
+        "within": float(within.mean()) if len(within) else math.nan,
+        "median_width": float(np.median((high - low) / said_mm2[counts])) if len(within) else math.nan,
     }
 
 

@@ -51,6 +51,8 @@ class Run:
     expected_mm2: list[float] = field(default_factory=list)
     found_mm2: list[float] = field(default_factory=list)
     besides_mm2: list[float] = field(default_factory=list)
+    promised_between_mm2: list[tuple[float, float]] = field(default_factory=list)
+    expected_between_mm2: list[tuple[float, float]] = field(default_factory=list)
     true_gain_mm2: list[float] = field(default_factory=list)
     planning_s: list[float] = field(default_factory=list)
 

@@ -1,20 +1,28 @@
 """What the passes of a session teach about promises: how much good surface each kind of evidence brings, how surely."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from drivers.scanline import Float64Array
-from scanner_service.rescan.passes.needs import FIRST_CHANCES, HIDDEN_KINDS, Evidence
+from scanner_service.rescan.passes.needs import FIRST_CHANCES, HIDDEN_KINDS, Chances, Evidence
 from scanner_service.rescan.passes.outcome import Outcome
-from scanner_service.rescan.passes.promises import FIRST_SPREADS, GRAINS_MM2, Experience
+from scanner_service.rescan.passes.promises import (
+    FIRST_BRINGS,
+    FIRST_SPREADS,
+    GUESSED_KINDS,
+    NO_EXPERIENCE,
+    Experience,
+)
 
 _FADING = 0.9  # what a pass taught of a kind weighs this much less after each further one that had places of it
 _FIRST_MM2 = 40.0  # the first chance weighs as much as a pass that asked for so much
+_FIRST_TOLD_MM2 = 20.0  # ... and what is told at first as one that asked for so much
 _ENOUGH_MM2 = 50.0  # a pass that asked for so much counts half of that, and none counts as more than this
-_HALF_MM2 = 20.0  # of how a kind varies a pass that asked for so much tells half as much as a very large one ...
-_FIRST_PASSES = 3.0  # ... of which the first spread weighs as many
+_FIRST_PASSES = 3.0  # the first spread weighs as many passes
+_HALF_MM2 = 2.0  # of how a kind varies a pass that expected so much tells half as much as a large one ...
+_FURTHEST = 3.0  # ... and a pass that was further off than so many deviations no more than that
 _LEAST = 0.05  # nothing is ruled out for good
 _WORN_PASSES = 10.0  # what is left of hidden space when so many passes have looked is surface 1/e as often ...
 _WORN_OUT = 0.4  # ... but is looked at, so that a loop does not end before it was
@@ -23,38 +31,49 @@ _WORN_OUT = 0.4  # ... but is looked at, so that a loop does not end before it w
 def experience_of(earlier: Sequence[Outcome]) -> Experience:
     """What a mm² of each kind of evidence brings, and how much that varies, after some passes, the oldest first.
 
-    The mean of what was reached for what was asked for, in which one large pass over a side that is unlike the others
-    does not decide; of a place that is known no more than its area. The spread is that of the passes around the mean,
-    less what small areas vary anyway. What is left of hidden space where passes looked in vain is the less likely
-    surface the more passes there were.
+    The spread is the first one, times how far the passes were from the mean beside how far they should have been, small
+    areas further than large ones.
     """
-    worn = _worn(len(earlier))
-    asked = np.full(len(Evidence), _FIRST_MM2)
-    reached = asked * np.array(FIRST_CHANCES) * worn
-    faded = np.ones(len(Evidence))
-    passes: list[list[tuple[float, float, float]]] = [[] for _ in Evidence]
+    chances = _means(earlier, FIRST_CHANCES, _FIRST_MM2, HIDDEN_KINDS)
+    brings = _means(earlier, FIRST_BRINGS, _FIRST_TOLD_MM2, GUESSED_KINDS)
+    weight = np.full(len(Evidence), _FIRST_PASSES)
+    square = weight.copy()
+    for kind, counts, asked_mm2, reached_mm2 in _passes(earlier):
+        foretold_mm2 = float(brings[kind]) * asked_mm2
+        off = (reached_mm2 - foretold_mm2) / NO_EXPERIENCE.deviation_mm2(kind, foretold_mm2)
+        tells = counts * foretold_mm2 / (foretold_mm2 + _HALF_MM2)
+        square[kind] += tells * min(off**2, _FURTHEST**2)
+        weight[kind] += tells
+    spreads = np.array(FIRST_SPREADS) * np.sqrt(square / weight)
+    return Experience(tuple(chances.tolist()), tuple(spreads.tolist()), tuple(brings.tolist()))
+
+
+def _means(earlier: Sequence[Outcome], first: Chances, first_mm2: float, unbounded: Sequence[Evidence]) -> Float64Array:
+    """By `Evidence`, the mean of what was reached for what was asked for.
+
+    One large pass over a side that is unlike the others does not decide; a place that is known brings no more than its
+    area. What is left of hidden space where passes looked in vain is surface the less often the more passes there were.
+    """
+    asked = np.full(len(Evidence), first_mm2)
+    reached = asked * np.array(first) * _worn(len(earlier))
+    for kind, counts, asked_mm2, reached_mm2 in _passes(earlier):
+        asked[kind] += counts * asked_mm2 / (1.0 + asked_mm2 / _ENOUGH_MM2)
+        reached[kind] += counts * reached_mm2 / (1.0 + asked_mm2 / _ENOUGH_MM2)
+    means = np.maximum(reached / asked, _LEAST)
+    known = [kind for kind in Evidence if kind not in unbounded]
+    means[known] = np.minimum(means[known], 1.0)
+    return means
+
+
+def _passes(earlier: Sequence[Outcome]) -> Iterator[tuple[Evidence, float, float, float]]:
+    """Of each pass and kind how much it counts, what was asked for as it would be now, and what was reached."""
+    faded, worn = np.ones(len(Evidence)), _worn(len(earlier))
     for number in reversed(range(len(earlier))):
         for one in earlier[number].kinds:
             if one.asked_mm2 > 0:
-                asked_mm2 = one.asked_mm2 * (_worn(number)[one.evidence] / worn[one.evidence])
-                counts = faded[one.evidence] / (1.0 + one.asked_mm2 / _ENOUGH_MM2)
-                asked[one.evidence] += counts * asked_mm2
-                reached[one.evidence] += counts * one.reached_mm2
-                tells = faded[one.evidence] * one.asked_mm2 / (one.asked_mm2 + _HALF_MM2)
-                passes[one.evidence].append((tells, one.reached_mm2 / asked_mm2, one.asked_mm2))
+                asked_mm2 = one.asked_mm2 * float(_worn(number)[one.evidence] / worn[one.evidence])
+                yield one.evidence, float(faded[one.evidence]), asked_mm2, one.reached_mm2
                 faded[one.evidence] *= _FADING
-    chances = np.maximum(reached / asked, _LEAST)
-    known = [kind for kind in Evidence if kind not in HIDDEN_KINDS]
-    chances[known] = np.minimum(chances[known], 1.0)
-    spreads = []
-    for kind in Evidence:
-        first = FIRST_SPREADS[kind]
-        square, weight = _FIRST_PASSES, _FIRST_PASSES
-        for tells, ratio, asked_mm2 in passes[kind]:
-            square += tells * max((ratio / chances[kind] - 1.0) ** 2 - GRAINS_MM2[kind] / asked_mm2, 0.0) / first**2
-            weight += tells
-        spreads.append(first * math.sqrt(square / weight))
-    return Experience(tuple(chances.tolist()), tuple(spreads))
 
 
 def _worn(passes: int) -> Float64Array:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.scanline import BoolArray, Float64Array, read_only
+from scanner_service.rescan.passes.again import looked_at_alike
 from scanner_service.rescan.passes.known_surface import KnownSurface
 from scanner_service.rescan.passes.motion import Motion
 from scanner_service.rescan.passes.needs import Needs
@@ -25,7 +26,8 @@ SERVED = 1.1
 class Prospect:
     """What a motion offers each place (n,): stage position, incidence, and the coarsest line spacing that is enough.
 
-    `position_mm` NaN: the laser plane never meets the place. `coarsest_mm` is 0 where no line spacing helps.
+    `position_mm` NaN: the laser plane never meets the place. `coarsest_mm` is 0 where no line spacing helps,
+    or an earlier pass has looked at the place from there.
     `per_line_mm` is the density (n,) times the line spacing: points for each mm along a line and mm of travel.
     `laser_blocked`, `camera_blocked`, `too_steep`, `out_of_range`, `out_of_fan` say why not.
     """
@@ -75,7 +77,8 @@ def prospect_of(surface: KnownSurface, needs: Needs, motion: Motion, optics: Sca
     out_of_fan = ~(np.abs(optics.across(sights.local_mm)) <= 1.0)
     asked = met & ~(too_steep | out_of_range | out_of_fan)
     laser, both = both_see(surface, needs.places_mm, needs.normals, sights, asked)
-    coarsest = np.where(both, np.fmin(density / (MARGIN * needs.density_per_mm2), by_lines), 0.0)
+    in_vain = looked_at_alike(surface, needs, motion, sights, optics)
+    coarsest = np.where(both & ~in_vain, np.fmin(density / (MARGIN * needs.density_per_mm2), by_lines), 0.0)
     return Prospect(
         position_mm=sights.position_mm.copy(),
         incidence_rad=np.arccos(np.clip(cosine, -1.0, 1.0)),

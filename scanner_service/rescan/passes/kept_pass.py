@@ -10,7 +10,7 @@ import numpy as np
 from drivers.scanline import Float64Array, Pose
 from scanner_service.rescan.passes.motion import Motion, StraightMotion, TurningMotion
 from scanner_service.rescan.passes.needs import FIRST_CHANCES, Evidence
-from scanner_service.rescan.passes.promises import FIRST_SPREADS, Experience
+from scanner_service.rescan.passes.promises import FIRST_BRINGS, FIRST_SPREADS, Experience
 from scanner_service.rescan.passes.reach import PartTurn
 from scanner_service.rescan.passes.recommendation import Promise, RecommendedPass, pose_dict
 
@@ -48,6 +48,7 @@ def keep_pass(one: RecommendedPass) -> dict[str, Any]:
         else [one.turn.about_vertical_rad, one.turn.tip_rad, *(one.turn.about_mm or ())],
         "chances": list(one.learned.chances),
         "spreads": list(one.learned.spreads),
+        "brings": list(one.learned.brings),
     }
 
 
@@ -76,7 +77,8 @@ def kept_pass(kept: Mapping[str, Any]) -> RecommendedPass:
     }  # fmt: skip
     turn = kept["turn"]
     chances = _by_kind(kept["chances"], FIRST_CHANCES)
-    learned = Experience(chances, _by_kind(kept.get("spreads", ()), FIRST_SPREADS))
+    brings = _by_kind(kept["brings"], FIRST_BRINGS) if "brings" in kept else chances  # once both were one
+    learned = Experience(chances, _by_kind(kept.get("spreads", ()), FIRST_SPREADS), brings)
     mm2, area_mm2, evidence = rows[:, 6].copy(), rows[:, 7].copy(), rows[:, 9].copy()
     if not np.isin(evidence, list(Evidence)).all():
         raise ValueError("a kept pass has places of a kind of evidence that nobody knows")

@@ -46,10 +46,11 @@ class KnownSurface:
     `state` (i, j, k) is UNTOUCHED, FREE, HIDDEN or SURFACE as in `marching`, `row` (i, j, k) the row of a cell with
     points, -1 without. One row a cell with points:
     `points_mm`, `normals` (m, 3; unit, towards the laser), `area_mm2`, `count`, `failing_share` (m,) and `region` (m,),
-    the number that failing points gave (0: none); `two_sided` (m,) where both sides of a thin wall were seen.
+    the number that failing points gave (0: none); `two_sided` (m,) where both sides of a thin wall were seen;
+    `by_shadow` (m,) where most of the failing points lack nothing but what a shadow beside them hides.
     `frontier_mm`, `frontier_normals` (f, 3) and `frontier_mm2` (f,) are where hidden space begins: surface that no
     point has touched may be there. `frontier_solid` (f,) is the share of what is solid or hidden around, and
-    `frontier_emptied` (f,) that of what passes have looked into in vain.
+    `frontier_emptied` (f,) that of what passes have looked into in vain. `looks` are passes whose poses are known.
     """
 
     low_mm: Float64Array
@@ -68,6 +69,8 @@ class KnownSurface:
     frontier_mm2: Float64Array
     frontier_solid: Float64Array
     frontier_emptied: Float64Array
+    by_shadow: BoolArray
+    looks: tuple[Look, ...] = ()
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -90,6 +93,7 @@ def know_surface(
     looks: tuple[Look, ...] = (),
     optics: ScannerOptics | None = None,
     nominal: Pieces | None = None,
+    by_shadow: BoolArray | None = None,
 ) -> KnownSurface:
     """The surface a map knows.
 
@@ -102,6 +106,7 @@ def know_surface(
     looks, optics : passes whose poses are known, and the scanner's: what they looked into in vain is not hidden.
     nominal : the nominal part, where there is one: what lies outside of it is not hidden, and its surface stands in the
         way.
+    by_shadow : (n,) True for points that fail for a shadow beside them alone; None: nobody knows.
     """
     use = snapshot.neighbours > 0
     points = snapshot.points_mm
@@ -158,7 +163,29 @@ def know_surface(
         frontier_mm2=side * side / np.maximum(np.abs(gradient).max(axis=1, initial=0.5), 0.5),
         frontier_solid=solid,
         frontier_emptied=emptied,
+        by_shadow=_mostly(by_shadow, fails, use, points, low, side, index, len(sums)),
+        looks=looks,
     )
+
+
+def _mostly(
+    which: BoolArray | None,
+    of: BoolArray,
+    use: BoolArray,
+    points_mm: Float64Array,
+    low_mm: Float64Array,
+    cell_mm: float,
+    index: npt.NDArray[np.int32],
+    cells: int,
+) -> BoolArray:
+    """(cells,) where more than half of some points, those `of` them that are used, are such."""
+    if which is None:
+        return np.zeros(cells, dtype=np.bool_)
+    rows = np.flatnonzero(of & use)
+    at = np.floor((points_mm[rows] - low_mm) / cell_mm).astype(np.int64)
+    row = index[at[:, 0], at[:, 1], at[:, 2]]
+    more: BoolArray = 2.0 * np.bincount(row, which[rows], cells) > np.bincount(row, minlength=cells)
+    return more
 
 
 def _frontier(state: npt.NDArray[np.uint8]) -> tuple[IntArray, Float64Array]:
@@ -230,4 +257,5 @@ def _nothing() -> KnownSurface:
     return KnownSurface(
         np.zeros(3), LEAST_CELL_MM, state, row, none, none.copy(), flat, whole, flat.copy(), whole.copy(),
         np.zeros(0, dtype=np.bool_), none.copy(), none.copy(), flat.copy(), flat.copy(), flat.copy(),
+        np.zeros(0, dtype=np.bool_),
     )  # fmt: skip

@@ -204,9 +204,9 @@ def reckon(
     missed[measured] &= ~good
     away, _ = _nearest(done.places_mm[reached > 0], done.places_mm, _BESIDE_MM)
     empty = missed & ~np.isfinite(away) & np.isin(done.place_evidence, HIDDEN_KINDS)
-    promised, said, explores = done.is_promised, done.promised, done.explores
+    told, promised, said, explores = done.told_mm2, done.is_promised, done.promised, done.explores
     regions = [
-        RegionOutcome(int(region), float(done.place_mm2[mine].sum()), float(reached[mine].sum()))
+        RegionOutcome(int(region), float(told[mine].sum()), float(reached[mine].sum()))
         for region in np.unique(done.place_regions)
         if (mine := promised & (done.place_regions == region)).any()
     ]

@@ -87,7 +87,8 @@ def plan_passes(
     regions = report.regions if regions is None else regions
     fails, region = failing_points(report, regions)
     pieces = None if reference is None else reference.pieces
-    surface = know_surface(snapshot, fails, region, wishes.cell_mm, looks, optics, pieces)
+    by_shadow = report.judgement.reason == Reason.SHADOW
+    surface = know_surface(snapshot, fails, region, wishes.cell_mm, looks, optics, pieces, by_shadow)
     missing = None if reference is None else missing_of(reference, regions)
     wanted = replace(Wanted.of(wishes.density_per_mm2, wishes.requirement), tops_up=wishes.tops_up)
     needs = find_needs(snapshot, report, surface, wanted, wishes.learned.chances, wishes.explore, regions, missing)

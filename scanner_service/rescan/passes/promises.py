@@ -7,30 +7,55 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from drivers.scanline import BoolArray, Float64Array
-from scanner_service.rescan.passes.needs import FIRST_CHANCES, HIDDEN_KINDS, Chances, Evidence
+from scanner_service.rescan.passes.needs import FIRST_CHANCES, Chances, Evidence
+
+GUESSED_KINDS = (Evidence.FLOOR, Evidence.FRONTIER, Evidence.BEYOND, Evidence.FAR, Evidence.REST)
+"""Nobody has seen this surface: it may not be there, or be more than was asked for."""
 
 Spreads = tuple[float, ...]
 """How far what a large pass brings of each kind lies from what was expected, by `Evidence`, as a share of that."""
-FIRST_SPREADS: Spreads = (0.05, 0.3, 0.2, 0.2, 1.0, 0.4, 1.0)
+FIRST_BRINGS: Chances = (0.98, 1.0, 1.2, 0.9, 4.0, 1.5, 5.0)
+"""Good surface for each mm² that is asked for, as passes brought it, before one of the session has shown it.
+
+Passes are chosen by `needs.FIRST_CHANCES`, which count on less where hidden space may be empty: by the mean of what
+comes they would be chosen for the most hidden space, which brings less than the mean."""
+FIRST_SPREADS: Spreads = (0.05, 0.3, 0.14, 0.2, 0.7, 0.18, 0.6)
 """... before a pass has shown it."""
-GRAINS_MM2: tuple[float, ...] = (0.05, 2.0, 3.0, 0.5, 6.0, 6.0, 6.0)
+GRAINS_MM2: tuple[float, ...] = (0.08, 2.0, 6.5, 0.5, 32.0, 5.5, 16.0)
 """Surface comes in pieces of about this size, by `Evidence`: who asks for less may find all or nothing."""
 _IN_VAIN = 1.0  # so much less sure is a place that a pass was in vain for
-EIGHTY_PERCENT = 1.2816
-"""Standard deviations to either side within which a normal variable lies four times in five."""
+_TAILS = (0.1, 0.9)
 PROMISED_WITHIN = 0.5
-"""What is promised comes four times in five within this share of it; what would widen that is explored, and so is a
-kind that varies by more than this itself."""
+"""A kind is promised where it comes four times in five within this share of what is expected; else it is explored."""
 
 
 @dataclass(frozen=True, slots=True)
 class Experience:
-    """What passes teach: good surface for each mm² asked for, and how much that varies, by `Evidence`."""
+    """What passes teach, by `Evidence`.
+
+    `chances` is what is counted on for each mm² asked for when passes are chosen, `brings` what is expected to come,
+    and `spreads` how much that varies.
+    """
 
     chances: Chances = FIRST_CHANCES
     spreads: Spreads = FIRST_SPREADS
+    brings: Chances = FIRST_BRINGS
+
+    def told_mm2(self, counted_mm2: Float64Array, evidence: Float64Array) -> Float64Array:
+        """(k,) what is expected of places of which so much (k,) was counted on, of kinds `evidence` (k,)."""
+        more: Float64Array = np.array(self.brings) / np.array(self.chances)
+        return counted_mm2 * more[evidence.astype(np.int64)]
+
+    def deviation_mm2(self, kind: Evidence, mm2: float) -> float:
+        """How far what such places bring lies from the `mm2` that are expected of them, one standard deviation.
+
+        In a session whose passes are further off, the pieces are larger, too.
+        """
+        off = self.spreads[kind] / FIRST_SPREADS[kind]
+        return math.hypot(self.spreads[kind] * mm2, off * math.sqrt(GRAINS_MM2[kind] * mm2))
 
 
 NO_EXPERIENCE = Experience()
@@ -53,13 +78,39 @@ class Expectation:
 
 @dataclass(frozen=True, slots=True)
 class _Lot:
-    """The places of a pass of one kind, those that a pass was in vain for apart."""
+    """The places of a pass of one kind, those that a pass was in vain for apart.
+
+    `most_mm2` is all they can bring, inf where nobody has seen them; `stands_alone`: what they bring has nothing to do
+    with what other kinds do.
+    """
 
     mine: BoolArray
-    may_be_promised: bool
+    stands_alone: bool
     mm2: float
     most_mm2: float
     deviation_mm2: float
+
+    @property
+    def is_firm(self) -> bool:
+        """Whether it may be promised."""
+        off_mm2 = max(self.mm2 - self.quantile_mm2(_TAILS[0]), self.quantile_mm2(_TAILS[1]) - self.mm2)
+        return self.stands_alone and off_mm2 <= PROMISED_WITHIN * self.mm2
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it may be promised, and its surface has been seen."""
+        return self.is_firm and math.isfinite(self.most_mm2)
+
+    def quantile_mm2(self, share: float) -> float:
+        """What it brings less than in this `share` of all cases.
+
+        What is guessed is a gamma variable, skewed as it comes: of a few mm² often nothing, and at times a side of the
+        part. What is known lies evenly around what is expected, and ends with its area.
+        """
+        if math.isinf(self.most_mm2):
+            scale = self.deviation_mm2**2 / self.mm2
+            return scale * float(special.gammaincinv(self.mm2 / scale, share)) if scale > 0.0 else self.mm2
+        return min(max(self.mm2 + float(special.ndtri(share)) * self.deviation_mm2, 0.0), self.most_mm2)
 
 
 def promised_places(
@@ -67,8 +118,8 @@ def promised_places(
 ) -> BoolArray:
     """(k,) which places a pass promises; the others it explores.
 
-    Kinds that vary by less than `PROMISED_WITHIN` are promised from the surest on, as long as the interval of all that
-    is promised stays within that, too. What a pass was in vain for is never promised.
+    Kind by kind, where what comes is within `PROMISED_WITHIN`. What a pass was in vain for is never promised, and
+    neither are guesses alone.
 
     Parameters
     ----------
@@ -76,16 +127,11 @@ def promised_places(
     evidence : why each is believed in (`Evidence`).
     tried : where passes were in vain.
     """
-    lots = [lot for lot in _lots(mm2, area_mm2, evidence, tried, learned) if lot.may_be_promised]
-    lots.sort(key=lambda lot: lot.deviation_mm2 / lot.mm2)
+    lots = _lots(mm2, area_mm2, evidence, tried, learned)
     promised = np.zeros(len(mm2), dtype=np.bool_)
-    total, variance = 0.0, 0.0
-    for lot in lots:
-        total += lot.mm2
-        variance += lot.deviation_mm2**2
-        if EIGHTY_PERCENT * math.sqrt(variance) > PROMISED_WITHIN * total:
-            break
-        promised |= lot.mine
+    if any(lot.is_known for lot in lots):
+        for lot in lots:
+            promised |= lot.mine & lot.is_firm
     return promised
 
 
@@ -94,20 +140,23 @@ def expectation_of(
 ) -> Expectation:
     """What places bring together; arguments as those of `promised_places`.
 
-    Each place is there or not, and each kind as a whole brings more or less than was foretold. What may be promised
-    does so kind by kind, so that squares add up; the other kinds, which are there or not as the part has a side there,
-    rise and fall together. Surface whose place is known cannot be more than its area.
+    Each place is there or not, and each kind as a whole brings more or less than was foretold. Where none of them is
+    known for sure there may be nothing: then the interval begins at 0.
     """
-    low, high, less, more = 0.0, 0.0, 0.0, 0.0
-    for lot in _lots(mm2, area_mm2, evidence, tried, learned):
-        half = EIGHTY_PERCENT * lot.deviation_mm2
-        down, up = min(half, lot.mm2), min(half, lot.most_mm2 - lot.mm2)
-        if lot.may_be_promised:
-            low, high = math.hypot(low, down), math.hypot(high, up)
-        else:
-            less, more = less + down, more + up
-    total = float(mm2.sum())
-    return Expectation(total, max(0.0, total - math.hypot(low, less)), total + math.hypot(high, more))
+    lots = _lots(mm2, area_mm2, evidence, tried, learned)
+    total = sum(lot.mm2 for lot in lots)
+    off = []
+    for share, sign in zip(_TAILS, (-1.0, 1.0), strict=True):
+        alone, together = 0.0, 0.0  # the kinds that do not stand alone are there or not as the part has a side there
+        for lot in lots:
+            by_mm2 = sign * (lot.quantile_mm2(share) - lot.mm2)
+            if lot.stands_alone:
+                alone = math.hypot(alone, max(by_mm2, 0.0))
+            else:
+                together += by_mm2
+        off.append(math.hypot(alone, max(together, 0.0)))
+    low = max(0.0, total - off[0]) if any(lot.is_known for lot in lots) else 0.0
+    return Expectation(total, low, total + off[1])
 
 
 def _lots(
@@ -120,11 +169,11 @@ def _lots(
             total = float(mm2[mine].sum())
             if total <= 0.0:
                 continue
-            area, spread = area_mm2[mine], learned.spreads[kind]
+            area = area_mm2[mine]
             there = np.minimum(mm2[mine] / area, 1.0)
-            share = math.sqrt(spread**2 + GRAINS_MM2[kind] * learned.chances[kind] / total)
-            share += _IN_VAIN if in_vain else 0.0
-            deviation = math.hypot(share * total, math.sqrt(float((area**2 * there * (1.0 - there)).sum())))
-            most = math.inf if kind in HIDDEN_KINDS else max(total, float(area.sum()))
-            found.append(_Lot(mine, not in_vain and spread <= PROMISED_WITHIN, total, most, deviation))
+            deviation = learned.deviation_mm2(kind, total) + (_IN_VAIN * total if in_vain else 0.0)
+            deviation = math.hypot(deviation, math.sqrt(float((area**2 * there * (1.0 - there)).sum())))
+            most = math.inf if kind in GUESSED_KINDS else max(total, float(area.sum()))
+            stands_alone = not in_vain and learned.spreads[kind] <= PROMISED_WITHIN
+            found.append(_Lot(mine, stands_alone, total, most, deviation))
     return found

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -49,11 +49,11 @@ class RecommendedPass:
     """A pass that can be carried out: the motion from `start_mm` to `end_mm`, lines `line_spacing_mm` apart.
 
     `duration_s` is the time of the pass itself, `approach_s` the time to get there (turning the part included);
-    `promises` what it is to give, region by region; `gain_mm2` their sum. `places_mm` (k, 3) are the places served,
-    `place_regions` (k,) their regions, `place_evidence` (k,) why they are believed in, `place_area_mm2` (k,) their
-    areas, `place_mm2` (k,) what of these is expected, `place_normals` (k, 3) where they face, and `place_tried` (k,)
-    where passes were in vain; they are kept for the reckoning afterwards. `turn` is what the operator does first;
-    `learned` is what earlier passes taught, by which the areas were multiplied.
+    `promises` what is counted on region by region when passes are chosen; `gain_mm2` their sum. `places_mm` (k, 3) are
+    the places served, `place_regions` (k,) their regions, `place_evidence` (k,) why they are believed in,
+    `place_area_mm2` (k,) their areas, `place_mm2` (k,) what of these is counted on, `place_normals` (k, 3) where they
+    face, and `place_tried` (k,) where passes were in vain; they are kept for the reckoning afterwards. `turn` is what
+    the operator does first; `learned` is what earlier passes taught, by which the areas were multiplied.
     """
 
     number: int
@@ -88,10 +88,26 @@ class RecommendedPass:
         return sum(promise.gain_mm2 for promise in self.promises)
 
     @property
+    def told_mm2(self) -> Float64Array:
+        """(k,) what is expected of each place served."""
+        return self.learned.told_mm2(self.place_mm2, self.place_evidence)
+
+    @property
+    def told(self) -> tuple[Promise, ...]:
+        """What is expected region by region, most first; together what is promised and what is explored."""
+        told_mm2, found = self.told_mm2, []
+        for promise in self.promises:
+            mine = self.place_regions == promise.region
+            counted_mm2 = float(self.place_mm2[mine].sum())
+            more = float(told_mm2[mine].sum()) / counted_mm2 if counted_mm2 > 0.0 else 1.0
+            found.append(replace(promise, gain_mm2=more * promise.gain_mm2))
+        return tuple(sorted(found, key=lambda one: -one.gain_mm2))
+
+    @property
     def is_promised(self) -> BoolArray:
         """(k,) the places served that are promised; what of the others is there is too unsure: they are explored."""
         return promised_places(
-            self.place_mm2, self.place_area_mm2, self.place_evidence, self.place_tried, self.learned
+            self.told_mm2, self.place_area_mm2, self.place_evidence, self.place_tried, self.learned
         )  # fmt: skip
 
     @property
@@ -106,14 +122,9 @@ class RecommendedPass:
 
     def _expected(self, places: BoolArray) -> Expectation:
         return expectation_of(
-            self.place_mm2[places], self.place_area_mm2[places], self.place_evidence[places],
+            self.told_mm2[places], self.place_area_mm2[places], self.place_evidence[places],
             self.place_tried[places], self.learned,
         )  # fmt: skip
-
-    @property
-    def gain_per_s(self) -> float:
-        """What it brings for its time."""
-        return self.gain_mm2 / (self.duration_s + self.approach_s)
 
     @property
     def line_count(self) -> int:
@@ -141,6 +152,7 @@ class RecommendedPass:
     def to_dict(self) -> dict[str, object]:
         """For JSON; what a person or a rig needs to carry it out."""
         promised, explores = self.promised, self.explores
+        told_mm2 = promised.mm2 + explores.mm2
         return {
             "number": self.number,
             "start_mm": self.start_mm,
@@ -157,13 +169,13 @@ class RecommendedPass:
             "laser_direction": (-self.start_pose.rotation[:, 2]).tolist(),
             "turn_part": None if self.turn is None or self.turn.is_none else str(self.turn),
             "turn_about_mm": None if self.turn is None or self.turn.about_mm is None else list(self.turn.about_mm),
-            "gain_mm2": self.gain_mm2,
+            "gain_mm2": told_mm2,
             "promised_mm2": promised.mm2,
             "promised_between_mm2": promised.between_mm2,
             "explores_mm2": explores.mm2,
             "explores_between_mm2": explores.between_mm2,
-            "gain_per_s_mm2": self.gain_per_s,
-            "serves": [promise.to_dict() for promise in self.promises],
+            "gain_per_s_mm2": told_mm2 / (self.duration_s + self.approach_s),
+            "serves": [promise.to_dict() for promise in self.told],
         }
 
 

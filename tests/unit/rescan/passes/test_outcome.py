@@ -41,8 +41,13 @@ def test_what_was_promised_what_was_explored_and_what_was_found_besides_is_all_t
     one = plan_passes(*before, free_reach(), OPTICS, Wishes(DENSITY, max_passes=1)).passes[0]
     bench.scan(one.motion, one.start_mm, one.end_mm, one.line_spacing_mm)
     outcome = reckon(one, *before, *bench.judged(), OPTICS)
-    assert outcome.promised_mm2 + outcome.expected_mm2 == pytest.approx(one.gain_mm2)
-    assert list(outcome.promised_between_mm2) == one.to_dict()["promised_between_mm2"]
+    told = one.to_dict()
+    assert outcome.promised_mm2 == pytest.approx(one.promised.mm2) == pytest.approx(told["promised_mm2"])
+    assert outcome.promised_mm2 + outcome.expected_mm2 == pytest.approx(told["gain_mm2"])
+    assert sum(region["gain_mm2"] for region in told["serves"]) == pytest.approx(told["gain_mm2"])
+    by_region = {region["region"] or 0: region["gain_mm2"] for region in told["serves"]}
+    assert all(region.promised_mm2 <= by_region[region.region] + 1e-9 for region in outcome.regions)
+    assert list(outcome.promised_between_mm2) == told["promised_between_mm2"]
     assert Outcome.from_dict(outcome.to_dict()).to_dict() == outcome.to_dict()
     asked = sum(kind.asked_mm2 * FIRST_CHANCES[kind.evidence] for kind in outcome.kinds)
     assert asked == pytest.approx(one.gain_mm2)
