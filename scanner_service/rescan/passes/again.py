@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from drivers.scanline import BoolArray, Float64Array
 from scanner_service.rescan.passes.known_surface import KnownSurface
@@ -41,9 +42,8 @@ def looked_at_alike(
 
 
 def _met(
-    look: Look, places_mm: Float64Array, sights: Sights, rows: np.ndarray[tuple[int], np.dtype[np.intp]],
-    optics: ScannerOptics,
-) -> BoolArray:  # fmt: skip
+    look: Look, places_mm: Float64Array, sights: Sights, rows: npt.NDArray[np.intp], optics: ScannerOptics
+) -> BoolArray:
     """(k,) whether a look had lines over places (k, 3), and its laser and camera where `sights` has them."""
     then = look.motion.sights(places_mm, optics)
     low, high = optics.geometry.range_mm
@@ -54,7 +54,7 @@ def _met(
         one, other = now_mm[rows] - places_mm, then_mm - places_mm
         size = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
         met &= np.einsum("ij,ij->i", one, other) >= _ALIKE * size
-    lost = look.returned.all(axis=1)  # a line that was lost says nothing
+    lost: BoolArray = np.asarray(look.returned.all(axis=1))  # a line that was lost says nothing
     met[met] = ~lost[np.rint(line[met]).astype(np.int64)]
     return met
 

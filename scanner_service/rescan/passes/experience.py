@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.scanline import Float64Array
 from scanner_service.rescan.passes.needs import FIRST_CHANCES, HIDDEN_KINDS, Chances, Evidence
-from scanner_service.rescan.passes.outcome import Outcome
+from scanner_service.rescan.passes.outcome import KindOutcome, Outcome
 from scanner_service.rescan.passes.promises import (
     FIRST_BRINGS,
     FIRST_SPREADS,
@@ -38,9 +38,9 @@ def experience_of(earlier: Sequence[Outcome]) -> Experience:
     brings = _means(earlier, FIRST_BRINGS, _FIRST_TOLD_MM2, GUESSED_KINDS)
     weight = np.full(len(Evidence), _FIRST_PASSES)
     square = weight.copy()
-    for kind, counts, asked_mm2, reached_mm2 in _passes(earlier):
-        foretold_mm2 = float(brings[kind]) * asked_mm2
-        off = (reached_mm2 - foretold_mm2) / NO_EXPERIENCE.deviation_mm2(kind, foretold_mm2)
+    for one, counts, asked_mm2 in _passes(earlier):
+        kind, foretold_mm2 = one.evidence, float(brings[one.evidence]) * asked_mm2
+        off = (one.reached_mm2 - foretold_mm2) / NO_EXPERIENCE.deviation_mm2(kind, foretold_mm2)
         tells = counts * foretold_mm2 / (foretold_mm2 + _HALF_MM2)
         square[kind] += tells * min(off**2, _FURTHEST**2)
         weight[kind] += tells
@@ -56,23 +56,24 @@ def _means(earlier: Sequence[Outcome], first: Chances, first_mm2: float, unbound
     """
     asked = np.full(len(Evidence), first_mm2)
     reached = asked * np.array(first) * _worn(len(earlier))
-    for kind, counts, asked_mm2, reached_mm2 in _passes(earlier):
-        asked[kind] += counts * asked_mm2 / (1.0 + asked_mm2 / _ENOUGH_MM2)
-        reached[kind] += counts * reached_mm2 / (1.0 + asked_mm2 / _ENOUGH_MM2)
-    means = np.maximum(reached / asked, _LEAST)
+    for one, counts, asked_mm2 in _passes(earlier):
+        less = counts / (1.0 + one.asked_mm2 / _ENOUGH_MM2)
+        asked[one.evidence] += less * asked_mm2
+        reached[one.evidence] += less * one.reached_mm2
+    means: Float64Array = np.maximum(reached / asked, _LEAST)
     known = [kind for kind in Evidence if kind not in unbounded]
     means[known] = np.minimum(means[known], 1.0)
     return means
 
 
-def _passes(earlier: Sequence[Outcome]) -> Iterator[tuple[Evidence, float, float, float]]:
-    """Of each pass and kind how much it counts, what was asked for as it would be now, and what was reached."""
+def _passes(earlier: Sequence[Outcome]) -> Iterator[tuple[KindOutcome, float, float]]:
+    """What became of each kind in each pass, how much that counts, and what was asked for as it would be now."""
     faded, worn = np.ones(len(Evidence)), _worn(len(earlier))
     for number in reversed(range(len(earlier))):
         for one in earlier[number].kinds:
             if one.asked_mm2 > 0:
                 asked_mm2 = one.asked_mm2 * float(_worn(number)[one.evidence] / worn[one.evidence])
-                yield one.evidence, float(faded[one.evidence]), asked_mm2, one.reached_mm2
+                yield one, float(faded[one.evidence]), asked_mm2
                 faded[one.evidence] *= _FADING
 
 
