@@ -54,13 +54,13 @@ def _means(earlier: Sequence[Outcome], first: Chances, first_mm2: float, unbound
     One large pass over a side that is unlike the others does not decide; a place that is known brings no more than its
     area. What is left of hidden space where passes looked in vain is surface the less often the more passes there were.
     """
-    asked = np.full(len(Evidence), first_mm2)
-    reached = asked * np.array(first) * _worn(len(earlier))
+    begun_with = np.array(first) * _worn(len(earlier))
+    asked, more = np.full(len(Evidence), first_mm2), np.zeros(len(Evidence))
     for one, counts, asked_mm2 in _passes(earlier):
         less = counts / (1.0 + one.asked_mm2 / _ENOUGH_MM2)
         asked[one.evidence] += less * asked_mm2
-        reached[one.evidence] += less * one.reached_mm2
-    means: Float64Array = np.maximum(reached / asked, _LEAST)
+        more[one.evidence] += less * (one.reached_mm2 - begun_with[one.evidence] * asked_mm2)
+    means: Float64Array = np.maximum(begun_with + more / asked, _LEAST)
     known = [kind for kind in Evidence if kind not in unbounded]
     means[known] = np.minimum(means[known], 1.0)
     return means
