@@ -22,7 +22,7 @@ FIRST_BRINGS: Chances = (0.98, 1.0, 1.2, 0.9, 4.0, 1.5, 5.0)
 
 Passes are chosen by `needs.FIRST_CHANCES`, which count on less where hidden space may be empty: by the mean of what
 comes they would be chosen for the most hidden space, which brings less than the mean."""
-FIRST_SPREADS: Spreads = (0.05, 0.3, 0.14, 0.2, 0.7, 0.18, 0.6)
+FIRST_SPREADS: Spreads = (0.05, 0.3, 0.16, 0.2, 0.7, 0.18, 0.6)
 """... before a pass has shown it."""
 GRAINS_MM2: tuple[float, ...] = (0.08, 2.0, 6.5, 0.5, 32.0, 5.5, 16.0)
 """Surface comes in pieces of about this size, by `Evidence`: who asks for less may find all or nothing."""
