@@ -10,7 +10,7 @@ import numpy as np
 from drivers.scanline import Pose
 from scanner_service.rescan.passes.experience import experience_of
 from scanner_service.rescan.passes.looks import Look, look_of
-from scanner_service.rescan.passes.motion import Motion
+from scanner_service.rescan.passes.motion import Motion, StraightMotion
 from scanner_service.rescan.passes.outcome import Outcome
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from scanner_service.rescan.passes.recommendation import Plan, RecommendedPass
@@ -76,7 +76,7 @@ class PlanQuestion:
     def _looks(self) -> tuple[Look, ...]:
         """The passes whose poses are known: those that were ordered, and the session's own."""
         snapshot, driven, own = self.results.snapshot, list(self.driven), self.setup.scanned_by
-        if own is not None:
+        if isinstance(own, StraightMotion):
             ordered = {number for number, *_ in driven}
             for number in sorted(set(snapshot.lines.pass_number.tolist()) - ordered):
                 at = snapshot.lines.position_mm[snapshot.lines.pass_number == number]
@@ -85,6 +85,7 @@ class PlanQuestion:
         found = [
             look_of(snapshot, number, motion, start_mm, end_mm, self.setup.optics.rays)
             for number, motion, start_mm, end_mm in driven
+            if isinstance(motion, StraightMotion)
         ]
         return tuple(look for look in found if look is not None)
 

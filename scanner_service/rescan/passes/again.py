@@ -8,7 +8,7 @@ import numpy.typing as npt
 from drivers.scanline import BoolArray, Float64Array
 from scanner_service.rescan.passes.known_surface import KnownSurface
 from scanner_service.rescan.passes.looks import MAX_LOOKS, Look
-from scanner_service.rescan.passes.motion import Motion, Sights
+from scanner_service.rescan.passes.motion import Motion, Sights, StraightMotion
 from scanner_service.rescan.passes.needs import Evidence, Needs
 from scanner_service.rescan.passes.optics import ScannerOptics
 
@@ -31,7 +31,7 @@ def looked_at_alike(
     motion, sights : the pass, and how it sees the needs.
     """
     alike = np.zeros(len(needs), dtype=np.bool_)
-    if not (surface.looks and len(needs)):
+    if not (isinstance(motion, StraightMotion) and surface.looks and len(needs)):
         return alike
     row = surface.row.reshape(-1)[surface.keys(needs.places_mm)]
     rows = np.flatnonzero((needs.evidence != Evidence.MEASURED) | ((row >= 0) & surface.by_shadow[row]))

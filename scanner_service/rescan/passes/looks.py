@@ -12,7 +12,7 @@ import numpy.typing as npt
 from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.passes.emptying import empty_places
-from scanner_service.rescan.passes.motion import Motion, StraightMotion
+from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.optics import ScannerOptics
 
 _RAYS_AROUND = 2
@@ -21,13 +21,13 @@ MAX_LOOKS = 64
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """One pass as it was driven, and which of its rays came back.
+    """One straight pass as it was driven, and which of its rays came back.
 
     `returned` (lines, rays) is True where a point of the line and ray, or of a neighbour, was measured; line k was
     taken at `start_mm` + k `step_mm`.
     """
 
-    motion: Motion
+    motion: StraightMotion
     start_mm: float
     step_mm: float
     returned: BoolArray
@@ -37,7 +37,7 @@ class Look:
 
 
 def look_of(
-    snapshot: MapSnapshot, pass_number: int, motion: Motion, start_mm: float, end_mm: float, rays: int
+    snapshot: MapSnapshot, pass_number: int, motion: StraightMotion, start_mm: float, end_mm: float, rays: int
 ) -> Look | None:
     """What came back of a pass of the map; None when none of its lines is there.
 
@@ -82,7 +82,7 @@ def mark_empty(
     frontier: npt.NDArray[np.int64],
     normals: Float64Array,
 ) -> int:
-    """Free the hidden cells of `state` that straight looks found empty; returns how many.
+    """Free the hidden cells of `state` that the looks found empty; returns how many.
 
     `frontier` (f, 3) are the cells where hidden space begins, `normals` (f, 3) where they face.
     """
@@ -91,8 +91,6 @@ def mark_empty(
     geometry = optics.geometry
     freed = 0
     for look in looks[-MAX_LOOKS:]:
-        if not isinstance(look.motion, StraightMotion):
-            continue
         pose = look.motion.at_zero
         along = look.motion.travel @ pose.rotation
         freed += empty_places(

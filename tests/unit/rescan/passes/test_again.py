@@ -10,13 +10,12 @@ from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.again import looked_at_alike
 from scanner_service.rescan.passes.known_surface import know_surface
 from scanner_service.rescan.passes.looks import Look, look_of
-from scanner_service.rescan.passes.motion import StraightMotion, TurningMotion
+from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.needs import Evidence, Needs, failing_points
 from scanner_service.rescan.passes.outcome import reckon
 from scanner_service.rescan.passes.planner import Wishes, plan_passes
 from simulators.parts import PARTS
 from simulators.shapes import Union, box
-from simulators.turntable import RADIUS_MM, stage_from_sensor
 from tests.unit.rescan.passes.posed_scans import DENSITY, FROM_ABOVE, OPTICS, Bench, linear_reach
 
 
@@ -102,16 +101,3 @@ def test_a_straight_stage_promises_nothing_that_it_has_looked_for_in_vain():
     assert kept[0] == pytest.approx(1.0, rel=0.05) and min(kept) > 0.6
     assert len(kept) < 3  # what is left is the shadows of the wall, and they are told as unreachable
     assert sum(one.area_mm2 for one in plan.unreachable) > 20.0
-
-
-def test_a_turntable_shows_each_place_from_one_side_only(stepped):
-    motion = TurningMotion(stage_from_sensor(), np.array([0.0, 0.0, 1.0]), RADIUS_MM)
-    around = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
-    outward = np.column_stack([np.cos(around), np.sin(around), np.zeros(72)])
-    needs = Needs.plain(10.0 * outward + [0.0, 0.0, 5.0], outward, np.full(72, 0.1), DENSITY)
-    needs = needs.changed(evidence=np.full(72, Evidence.FLOOR, dtype=np.int64))
-    sights = motion.sights(needs.places_mm, OPTICS)
-    third = Look(motion, 0.0, 0.5, np.zeros((51, OPTICS.rays), dtype=np.bool_))
-    surface = dataclasses.replace(known(stepped[0]), looks=(third,))
-    alike = looked_at_alike(surface, needs, motion, sights, OPTICS)
-    assert alike.tolist() == (sights.position_mm <= 25.0).tolist() and 10 < alike.sum() < 40
