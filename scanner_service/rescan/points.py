@@ -157,13 +157,15 @@ class PointVerdicts:
         self._columns.make_room(len(snapshot))
         rows = rows_of_lines(snapshot, lines)
         line, group = snapshot.line[rows], stations.group[snapshot.line[rows]]
+        owner = np.searchsorted(lines, line).astype(np.int64)
+        along, axis = frames.of_lines(snapshot.lines, lines, stations.group[lines])
         angle, depth = angle_and_depth(
-            snapshot.points_mm[rows] - snapshot.lines.laser_mm[line], frames.along[group], frames.axis[group]
+            snapshot.points_mm[rows] - snapshot.lines.laser_mm[line], along[owner], axis[owner]
         )
         self._columns.put(rows, **{"fan.angle_rad": angle, "fan.depth_mm": depth})
         self._columns.put(changed, counted=snapshot.neighbours[changed] > 0, marks=np.zeros(len(changed), np.uint8))
         count = len(stations.group)
-        boxes = boxes_of(snapshot.points_mm[rows], np.searchsorted(lines, line).astype(np.int64), len(lines))
+        boxes = boxes_of(snapshot.points_mm[rows], owner, len(lines))
         low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
         low[: len(self._boxes)], high[: len(self._boxes)] = self._boxes.low_mm, self._boxes.high_mm
         low[lines], high[lines] = boxes.low_mm, boxes.high_mm

@@ -95,7 +95,7 @@ def nearer_first(snapshot: MapSnapshot, gaps: Gaps, rows: IntArray, ends: IntArr
 def _normals(snapshot: MapSnapshot, frames: Frames, gaps: Gaps, rows: IntArray) -> Float64Array:
     """(k, 3) unit normals of the cuts, such that what a gap hides lies along normal x way from its upper end."""
     way = _unit(snapshot.points_mm[gaps.low[rows]] - snapshot.points_mm[gaps.high[rows]])
-    along, axis = frames.along[gaps.group[rows]], frames.axis[gaps.group[rows]]
+    along, axis = frames.of_lines(snapshot.lines, gaps.line[rows], gaps.group[rows])
     aside = np.where(gaps.across[rows, None], along, np.cross(along, axis))
     normal = _unit(aside - way * np.einsum("ij,ij->i", aside, way)[:, None])
     towards_seen = np.einsum("ij,ij->i", np.cross(normal, way), _onward(snapshot, gaps, rows))
