@@ -376,5 +376,19 @@ def test_what_is_asked_for_is_set_on_the_page_and_a_hand_is_guided_along_the_pas
     assert "promised" in page.text("#orders .pass:first-child").lower()
     refused = service.client.get(f"{where}/pass-orders/{order['order']}/guidance")
     assert (refused.status_code, "is done" in refused.json()["detail"]) == (409, True)
+
+    before = service.status(session_id)["points"]
+    page.until("document.querySelector('#plan-note').textContent === ''")
+    withdraw = page.tab.locator("#orders .pass:first-child button")
+    withdraw.focus()
+    page.tab.keyboard.press("Enter")
+    assert withdraw.text_content() == "Press again: its points leave the map"
+    page.tab.keyboard.press("Escape")
+    assert withdraw.text_content() == "Withdraw"
+    for _ in range(2):
+        page.tab.keyboard.press("Enter")
+    page.until("document.querySelector('#orders .badge')?.textContent === 'withdrawn'")
+    assert service.status(session_id)["points"] < before - 1000
+    assert "reached" not in page.text("#orders .pass:first-child")
     assert [complaint for complaint in page.complaints if "422" not in complaint and "409" not in complaint] == []
     page.tab.close()

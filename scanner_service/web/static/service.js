@@ -96,6 +96,12 @@ export const acceptPass = (id, number, plan) => send(sessionPath(id, `recommende
 
 export const cancelOrder = (id, order) => answer(sessionPath(id, `pass-orders/${order}`), { method: "DELETE" });
 
+// Take what an order has scanned out of the map; answered when all is judged anew.
+export const withdrawOrder = (id, order) => answer(sessionPath(id, `pass-orders/${order}/withdraw`), { method: "POST" });
+
+// Count what a doubted order has brought after all.
+export const keepOrder = (id, order) => answer(sessionPath(id, `pass-orders/${order}/keep`), { method: "POST" });
+
 // Where the scanner is beside a pass that a hand scans: {along_mm, aside_mm, angle_deg, speed_mm_per_s, wanted_mm_per_s, say}.
 export const guidanceOf = (id, order) => answer(sessionPath(id, `pass-orders/${order}/guidance`));
 

@@ -75,6 +75,7 @@ test("a pass names its regions as the list does, an order what became of it", ()
   assert.equal(fate({ status: "done", message: null, outcome, reached_end: true }), "promised 12 (8 to 15), reached 9 mm²; explored: 55 found, 30 (0 to 81) mm² expected");
   assert.equal(fate({ status: "done", message: null, outcome: { ...outcome, promised_mm2: 0 }, reached_end: true }), "explored: 55 found, 30 (0 to 81) mm² expected");
   assert.equal(fate({ status: "failed", message: "the port is gone", outcome: null, reached_end: false }), "the port is gone");
+  for (const status of ["doubted", "withdrawn"]) assert.doesNotMatch(fate({ status, message: null, outcome, reached_end: true }), /reached|found/);
 });
 
 test("while a plan is made that is said, with the seconds once there are some", () => {
