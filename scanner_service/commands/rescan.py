@@ -192,8 +192,11 @@ def _tell_plan(plan: dict[str, Any]) -> None:
         said = f"pass {one['number']} serves {_served(one)}: {_foretold(one)}{first}"
         console.print(said, highlight=False, soft_wrap=True)
     for lost in plan["unreachable"]:
-        what = "surface outside of any region" if lost["region"] is None else f"region {lost['region']}"
-        console.print(f"{what}: {lost['area_mm2']:.1f} mm² unreachable: {lost['why']}", highlight=False, soft_wrap=True)
+        of = "outside of any region, as guessed" if lost["region"] is None else f"of region {lost['region']}"
+        said = (
+            f"unreachable: {lost['area_mm2']:.1f} mm² {of}, {lost['share']:.0%} of what is wanted there: {lost['why']}"
+        )
+        console.print(said, highlight=False, soft_wrap=True)
     if plan["passes"]:
         said = f"This is plan {plan['plan']}; --pass NUMBER --plan {plan['plan']} carries one out."
         console.print(said, highlight=False, soft_wrap=True)

@@ -1,7 +1,7 @@
 // Recommended passes beside the picture: the list, buttons to accept and carry out, and what became of each order.
 
 import { byId, element } from "./element.js";
-import { plural, sentence, significant, whole, words } from "./numbers.js";
+import { percent, plural, sentence, significant, whole, words } from "./numbers.js";
 import { pressedTwice } from "./second_press.js";
 import { acceptPass, cancelOrder, carryOut, endLoop, keepOrder, listOrders, listPasses, loopState, startLoop, withdrawOrder } from "./service.js";
 
@@ -31,6 +31,10 @@ export function foretold({ promised_mm2, promised_between_mm2, explores_mm2, exp
   const explores = explores_mm2 >= 0.5 || !promised ? `explores for ${area(explores_mm2, explores_between_mm2)}` : "";
   return `${[promised, explores].filter(Boolean).join(", ")} mm²`;
 }
+
+// Surface that no pass brings: as much of its region as this reason holds for, or of the guess where none lists it.
+export const outOfReach = ({ region, area_mm2, share, why }) =>
+  `Unreachable: ${significant(area_mm2, 2)} mm² ${region === null ? "outside of any region, as guessed" : `of region ${region}`} (${percent(share)} of what is wanted there): ${why}`;
 
 // What became of an order that is over, in words; "" while nothing has.
 export function fate({ status, message, outcome, reached_end: whole }) {
@@ -155,10 +159,10 @@ export class PassesPanel {
     await this.#refresh(true);
   }
 
-  #drawPlan({ plan, passes }) {
+  #drawPlan({ plan, passes, unreachable }) {
     byId("passes-count").textContent = String(passes.length);
     const none = element("li.empty", {}, "Nothing that this rig reaches would be a gain.");
-    byId("passes").replaceChildren(...(passes.length ? passes.map((one) => this.#pass(one, plan)) : [none]));
+    byId("passes").replaceChildren(...(passes.length ? passes.map((one) => this.#pass(one, plan)) : [none]), ...unreachable.map((one) => element("li.small", {}, outOfReach(one))));
     this.onPass(null);
   }
 
