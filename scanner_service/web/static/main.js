@@ -5,6 +5,7 @@ import { byId, element } from "./element.js";
 import { ExportMenu } from "./exports.js";
 import { freeAreas } from "./free_areas.js";
 import { drawRuler, drawTriad } from "./gauges.js";
+import { untilReady } from "./getting_ready.js";
 import { Guide } from "./guide.js";
 import { InterestBox } from "./interest_box.js";
 import { listenToKeys } from "./keyboard.js";
@@ -395,4 +396,4 @@ globalThis.viewer = Object.freeze({
 listen();
 drawFigures(byId("figures"), null, session.store, null);
 applyLook();
-picker.begin(new URLSearchParams(location.search).get("session"));
+untilReady(notice).then(() => session.id ?? picker.begin(new URLSearchParams(location.search).get("session")));

@@ -8,7 +8,7 @@ import { reasonByKey, RESCAN_REASONS, rescanReason, STATE_ISOLATED, STATE_NOT_CO
 
 const figure = (name, value, unit = null) => element("div", {}, element("dt", {}, name), element("dd", {}, value, unit === null ? null : element("span.unit", {}, unit)));
 
-const UNDER_WAY = new Set(["scanning", "paused"]);
+export const UNDER_WAY = new Set(["scanning", "paused"]);
 
 // Nobody knows of the surface that a scan has still to come to, unless there is a nominal part.
 export function coverageName(status) {

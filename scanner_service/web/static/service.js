@@ -26,6 +26,13 @@ async function answer(path, options) {
 
 const sessionPath = (id, rest) => `api/v1/sessions/${encodeURIComponent(id)}/${rest}`;
 
+// {checks, preparing}: whether sessions can be opened, and what is still being done for that.
+export const readiness = () =>
+  answer("readyz").catch((refusal) => {
+    if (refusal.status === 503 && refusal.body?.checks) return refusal.body;
+    throw refusal;
+  });
+
 // {sessions, next}: one page of sessions; `next` goes into `after` for the following page, null when there is none.
 export const listSessions = (after = null) => answer(`api/v1/sessions${after === null ? "" : `?after=${encodeURIComponent(after)}`}`);
 
