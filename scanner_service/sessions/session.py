@@ -345,7 +345,7 @@ class LiveSession:
                 self._course.message,
                 self.doubted,
                 self._course.remark,
-                results.reference_refused if results else None,
+                *(results.said if results else ()),
             ),
             held=self._course.is_held,
             holds=results.holds if results is not None else None,

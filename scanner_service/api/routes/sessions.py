@@ -247,6 +247,7 @@ def _requirement_answer(session: LiveSession) -> dict[str, Any]:
         "coverage": status.coverage,
         "coverage_kind": status.coverage_kind,
         "reference_refused": None if results is None else results.reference_refused,
+        "remarks": [] if results is None else results.remarks,
     }
 
 

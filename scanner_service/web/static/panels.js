@@ -16,7 +16,10 @@ export function coverageName(status) {
   return UNDER_WAY.has(status?.state) ? "Coverage so far" : "Observed coverage";
 }
 
-export const noRegions = (status) => (UNDER_WAY.has(status?.state) ? "No region of the surface seen so far needs another scan." : "No region needs another scan.");
+export function noRegions(status) {
+  if (UNDER_WAY.has(status?.state)) return "No region of the surface seen so far needs another scan.";
+  return status?.coverage === null ? "Nothing was judged." : "No region needs another scan."; // such as where all lies outside of what is of interest
+}
 
 export function drawFigures(place, status, store, box) {
   const size = box ? box.high.map((high, axis) => significant(high - box.low[axis])).join(" × ") : "–";
