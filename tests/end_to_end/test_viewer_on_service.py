@@ -125,12 +125,14 @@ def test_a_live_scan_never_shrinks_and_ends_as_the_service_has_it(running: Any, 
     page.tab.fill("#ask-density_per_mm2", "200")  # of all that was scanned: no region stays as it was
     page.tab.click("#requirement-apply")
     page.until("document.querySelector('#requirement-said').textContent.startsWith('200 points/mm²')")
+    page.until("document.querySelector('#judging-text').textContent.match(/^Judged: [0-9]+ region/)")
     page.until("viewer.regions > 0 && viewer.connection === 'finished'")
     now = regions_of(service, session_id)
     assert [int(number) for number in page.tab.locator("#regions .number").all_text_contents()] == [
         one["id"] for one in now
     ]
-    assert page.tab.locator("#regions .density").all_text_contents()[0].endswith("≥ 200points/mm²")
+    said = page.tab.locator("#regions .density").all_text_contents()
+    assert lost or said[0].endswith("≥ 200points/mm²")  # lines that were lost are missed first, by their spacing
     assert page.complaints == []
     page.tab.close()
 

@@ -53,7 +53,7 @@ const guide = new Guide(byId("guide"), (share) => {
   arrow.at(share);
   view.invalidate();
 });
-const passes = new PassesPanel({ trouble, scanned: () => session.open(session.id), onOrder: followOrder, onPass: (pass) => showPass(pass ?? ordered?.pass ?? null) });
+const passes = new PassesPanel({ trouble, scanned: () => session.renew(), onOrder: followOrder, onPass: (pass) => showPass(pass ?? ordered?.pass ?? null) });
 const judging = new JudgingNote(() => session.regions);
 const awaiting = {
   onAsked: () => judging.ask(),
@@ -61,7 +61,7 @@ const awaiting = {
   onRefused: () => judging.open(),
   onJudged: () => {
     judging.answered();
-    if (connectionState === "finished") session.open(session.id); // nothing more comes by itself
+    if (connectionState === "finished") session.renew(); // nothing more comes by itself
   },
 };
 const requirement = new RequirementPanel({ onInterest: showInterest, partBox, ...awaiting });
