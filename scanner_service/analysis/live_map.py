@@ -247,6 +247,10 @@ class LiveMap:
         """True for a pass that is known and not withdrawn."""
         return self._passes.is_in_force(key)
 
+    def pass_keys(self, numbers: Iterable[int]) -> list[PassKey]:
+        """The names of passes that are told by their number, as the lines of a snapshot have it."""
+        return self._passes.keys_of(numbers)
+
     def close_all_passes(self) -> None:
         """Close every pass that is open."""
         for key in self._passes.open_keys():

@@ -1,6 +1,7 @@
 """Which passes of a map are open, where their laser planes are, and which lines stand still; knows no points."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -147,6 +148,11 @@ class PassBook:
             return None
         known.is_withdrawn = True
         return known.number
+
+    def keys_of(self, numbers: Iterable[int]) -> list[PassKey]:
+        """The names of passes that are known by their number in the session."""
+        keys = list(self._passes)
+        return [keys[number] for number in numbers]
 
     def is_in_force(self, key: PassKey) -> bool:
         """True for a pass that is known and not withdrawn."""

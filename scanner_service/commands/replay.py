@@ -145,6 +145,8 @@ def _facts(session: LiveSession) -> dict[str, Any]:
 def tell(regions: Any, summary: dict[str, Any], out: Path) -> None:
     """Print the regions as a table, and what the scan came to."""
     tell_regions(regions)
+    for note in summary["notes"]:
+        console.print(f"note: {note}", highlight=False, soft_wrap=True)
     share, held = summary["coverage"]["share"], summary["coverage"]["holds"]
     nominal = summary["coverage"]["kind"] == "reference"
     console.print(

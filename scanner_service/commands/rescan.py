@@ -1,5 +1,6 @@
 """`scanner rescan`: recommended passes of a session of a running service: list, carry out, or the whole closed loop."""
 
+import contextlib
 import time
 from collections.abc import Sequence
 from typing import Annotated, Any
@@ -17,7 +18,8 @@ _POLL_S = 0.3
 _PLANNED_S = 900.0
 """A plan takes a second or two; on a computer that is busy with much else, minutes."""
 _PLANNING = "planning passes …"
-_OVER = ("done", "failed", "cancelled")
+_UNDER_WAY = ("accepted", "running")
+_UNCOUNTED = {"doubted": "doubted: nothing of it is counted", "withdrawn": "withdrawn: its points are out of the map"}
 
 
 def rescan_command(
@@ -27,6 +29,10 @@ def rescan_command(
     turned: Annotated[bool, typer.Option("--turned", help="The part lies as the pass asks.")] = False,
     auto: Annotated[bool, typer.Option("--auto", help="Repeat until nothing is left to do.")] = False,
     cancel: Annotated[int | None, typer.Option("--cancel", help="Give up this accepted order.")] = None,
+    withdraw: Annotated[
+        int | None, typer.Option("--withdraw", help="Take what this order scanned out of the map.")
+    ] = None,
+    keep: Annotated[int | None, typer.Option("--keep", help="Count a doubted order: it lies where it should.")] = None,
     region: Annotated[list[int] | None, typer.Option("--region", min=1, help="Serve this region; repeatable.")] = None,
     reason: Annotated[list[str] | None, typer.Option("--reason", help="Serve this reason; repeatable.")] = None,
     max_passes: Annotated[int, typer.Option(min=1, max=200, help="Most passes of --auto.")] = 20,
@@ -41,8 +47,10 @@ def rescan_command(
 ) -> None:
     """List the recommended passes of a session, carry one out, or all of them by themselves."""
     with plain_errors():
-        if sum((auto, carry_out is not None, cancel is not None)) > 1:
-            fail("say one of --pass, --auto and --cancel")
+        asked = {"cancel": cancel, "withdraw": withdraw, "keep": keep}
+        decided = [(verb, order) for verb, order in asked.items() if order is not None]
+        if sum((auto, carry_out is not None, len(decided))) > 1:
+            fail("say one of --pass, --auto, --cancel, --withdraw and --keep")
         if coverage is not None and not auto:
             fail("--coverage ends a loop: say --auto as well")
         if (carry_out is None) != (plan is None):
@@ -59,8 +67,9 @@ def rescan_command(
                 result = _loop(client, where, limits | chosen, as_json)
             elif carry_out is not None and plan is not None:
                 result = _one(client, where, carry_out, plan, turned, serving)
-            elif cancel is not None:
-                result = _ask(client.delete(f"{where}/pass-orders/{cancel}"))
+            elif decided:
+                verb, order = decided[0]
+                result = _decide(client, f"{where}/pass-orders/{order}", verb)
             else:
                 with waiting_for(_PLANNING):
                     result = _ask(client.get(f"{where}/recommended-passes", params=serving, timeout=_PLANNED_S))
@@ -69,7 +78,7 @@ def rescan_command(
         elif auto:
             _tell_orders(result["orders"])
             console.print(f"The loop ended: {result['loop']['why_ended']}.", highlight=False, soft_wrap=True)
-        elif carry_out is not None or cancel is not None:
+        elif carry_out is not None or decided:
             _tell_orders([result])
         else:
             _tell_plan(result)
@@ -84,7 +93,7 @@ def _loop(client: httpx.Client, where: str, limits: dict[str, Any], quiet: bool)
         while True:
             loop = _ask(client.get(f"{where}/rescan"))["loop"]
             orders = _ask(client.get(f"{where}/pass-orders"))["orders"]
-            while told < len(orders) and orders[told]["status"] in _OVER:
+            while told < len(orders) and orders[told]["status"] not in _UNDER_WAY:
                 if not quiet:
                     said = f"order {orders[told]['order']}: {_said(orders[told])}"
                     errors.print(said, highlight=False, soft_wrap=True)
@@ -113,7 +122,7 @@ def _one(client: httpx.Client, where: str, number: int, plan: str, turned: bool,
     said = ""
     while True:
         order = _ask(client.get(mine))
-        if order["status"] in _OVER:
+        if order["status"] not in _UNDER_WAY:
             return dict(order)
         if by_hand:
             guidance = client.get(f"{mine}/guidance")
@@ -124,6 +133,14 @@ def _one(client: httpx.Client, where: str, number: int, plan: str, turned: bool,
         time.sleep(_POLL_S)
 
 
+def _decide(client: httpx.Client, order: str, verb: str) -> Any:
+    """Cancel, withdraw or keep an order; what it is then."""
+    if verb == "cancel":
+        return _ask(client.delete(order))
+    with waiting_for("judging the scan anew …") if verb == "withdraw" else contextlib.nullcontext():
+        return _ask(client.post(f"{order}/{verb}", timeout=_PLANNED_S))
+
+
 def _said(order: dict[str, Any]) -> str:
     one = order["pass"]
     head = f"{one['start_mm']:.1f} to {one['end_mm']:.1f} mm, lines {one['line_spacing_mm']:.3f} mm apart"
@@ -132,16 +149,17 @@ def _said(order: dict[str, Any]) -> str:
 
 def fate_of(order: dict[str, Any]) -> str:
     """What became of an order, in words."""
-    told = [order["status"]]
-    if (outcome := order["outcome"]) is not None:
+    told, outcome = [_UNCOUNTED.get(order["status"], order["status"])], order["outcome"]
+    if order["status"] == "doubted" and outcome is not None:
+        decide = "`scanner rescan SESSION --withdraw {0}`, then scan it again; if not, `--keep {0}`"
+        told.append(f"{outcome['doubt']} If so, {decide.format(order['order'])}")
+    elif order["status"] != "withdrawn" and outcome is not None:
         if outcome["promised_mm2"] >= 0.5 or outcome["expected_mm2"] < 1.0:
             promised = _area(outcome["promised_mm2"], outcome["promised_between_mm2"])
             told.append(f"promised {promised}, reached {outcome['reached_mm2']:.0f} mm²")
         if outcome["expected_mm2"] >= 1.0:
             expected = _area(outcome["expected_mm2"], outcome["expected_between_mm2"])
             told.append(f"explored: {outcome['found_mm2']:.0f} mm² found, {expected} expected")
-        if outcome["doubt"]:
-            told.append(f"warning: {outcome['doubt']}")
     if order["status"] == "done" and order["reached_end"] is False:
         told.append("ended before its end")
     if order["message"]:
@@ -174,8 +192,11 @@ def _tell_plan(plan: dict[str, Any]) -> None:
         said = f"pass {one['number']} serves {_served(one)}: {_foretold(one)}{first}"
         console.print(said, highlight=False, soft_wrap=True)
     for lost in plan["unreachable"]:
-        what = "surface outside of any region" if lost["region"] is None else f"region {lost['region']}"
-        console.print(f"{what}: {lost['area_mm2']:.1f} mm² unreachable: {lost['why']}", highlight=False, soft_wrap=True)
+        of = "outside of any region, as guessed" if lost["region"] is None else f"of region {lost['region']}"
+        said = (
+            f"unreachable: {lost['area_mm2']:.1f} mm² {of}, {lost['share']:.0%} of what is wanted there: {lost['why']}"
+        )
+        console.print(said, highlight=False, soft_wrap=True)
     if plan["passes"]:
         said = f"This is plan {plan['plan']}; --pass NUMBER --plan {plan['plan']} carries one out."
         console.print(said, highlight=False, soft_wrap=True)

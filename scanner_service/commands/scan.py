@@ -50,10 +50,9 @@ def scan_command(
                 rig.name, spec, SessionSettings(target=Requirement(density_per_mm2=density)), (0.0, 0.0, 0.0), source
             )
             play(live, quiet=as_json)
-            said = live.status().message
-            if said:
+            said, summary = live.status().message, write_outputs(out, live)
+            if said and said not in summary["notes"]:
                 errors.print(f"note: {said}", highlight=False, soft_wrap=True)
-            summary = write_outputs(out, live)
             results = live.results()
         if as_json:
             show_json(summary)

@@ -1,4 +1,4 @@
-"""Waiting for a service that was just started and compiles its kernels; says meanwhile how far that is."""
+"""Waiting for a service that was just started and loads or compiles its kernels; says meanwhile how far that is."""
 
 import time
 
@@ -6,7 +6,7 @@ import httpx
 
 from scanner_service.commands.terminal import fail, waiting_for
 
-SAID = "compiling kernels (only the first time) …"
+SAID = "preparing kernels …"
 _COMPILING_S = 600.0
 _POLL_S, _ANSWER_S = 0.2, 5.0
 
@@ -35,4 +35,5 @@ def _says_ready(client: httpx.Client) -> str | None:
     now = told["preparing"]
     if now is None:
         return SAID
-    return f"compiling {now['what']}, step {now['step']} of {now['of']} (only the first time) …"
+    verb, when = ("compiling", " (only the first time)") if now["compiles"] else ("loading", "")
+    return f"{verb} {now['what']}, step {now['step']} of {now['of']}{when} …"

@@ -2,8 +2,9 @@
 
 A region is known by the surface it covers, cut into cubes of a few radii. A new region takes the id of the old one it
 shares most cubes with, of the same reason first. An old region that no new one continues is *resolved* when all points
-on its cubes are settled, unless something of its points was not judged again; until then it keeps its status. Every
-change is a moment of its history. Knows no session and no record.
+on its cubes are settled, unless something of its points was not judged again; until then it keeps its status. One whose
+pass was withdrawn goes with it, and its history says so. Every change is a moment of its history. Knows no session and
+no record.
 """
 
 import math
@@ -22,6 +23,8 @@ from scanner_service.rescan.stations import IntArray
 _CUBE_MM = 1.5
 _OVER = 0.1  # share of a region's cubes that a later pass must touch before the region counts as rescanned
 _SHOWN = "no verdict finds it any more: what it hid is seen, or there is nothing"
+_GONE = "the pass that found it was withdrawn"
+_OVER_IS_GONE = "the pass that was over it was withdrawn"
 _MOST_MOMENTS = 64
 _KEPT_CUBES = 40
 _MOST_RESOLVED = 1000
@@ -45,6 +48,12 @@ class _Known:
     region: RescanRegion
     cubes: set[tuple[int, int, int]]
     passes: frozenset[int]  # that had points on it when it was found, or when it last counted as rescanned
+    later: frozenset[int] = frozenset()  # those of them that were over it since it was found
+
+    @property
+    def found_by(self) -> frozenset[int]:
+        """The passes that had points on it when it was found."""
+        return self.passes - self.later
 
 
 class RegionBook:
@@ -81,22 +90,27 @@ class RegionBook:
         kept: dict[int, _Known] = {}
         for region, cubes, known_id in zip(regions, fresh, ids, strict=True):
             old = self._known.get(known_id) or self._resolved.get(known_id)
-            passes = surface.passes_on(cubes)
+            on_it = surface.passes_on(cubes)
             if old is None:
-                kept[self._next] = self._begun(region, cubes, passes, changes)
+                kept[self._next] = self._begun(region, cubes, on_it, changes)
                 self._next += 1
             else:
-                kept[known_id] = self._continued(known_id, old, region, cubes, passes, changes)
+                kept[known_id] = self._continued(
+                    known_id, old, region, cubes, on_it, old.passes - surface.passes, changes
+                )
                 self._resolved.pop(known_id, None)
         for known_id, old in self._known.items():
             if known_id in kept:
                 continue
-            if not surface.is_settled(old.cubes) or not surface.is_there(old.cubes, old.region):
+            is_withdrawn = not old.found_by <= surface.passes
+            is_there = is_withdrawn or surface.is_there(old.cubes, old.region)
+            if not surface.is_settled(old.cubes) or not is_there:
                 kept[known_id] = old  # it waits for points to settle
                 continue
             merged = [other for other, cubes in zip(ids, fresh, strict=True) if other and len(cubes & old.cubes)]
             why = "its surface meets the requirement" if old.region.reason is not Reason.SHADOW else _SHOWN
             why = f"is part of region {merged[0]} now" if merged else why
+            why = _GONE if is_withdrawn else why
             self._resolved[known_id] = _stepped(known_id, old, RegionStatus.RESOLVED, why, self._version, changes)
         while len(self._resolved) > _MOST_RESOLVED:
             del self._resolved[min(self._resolved)]
@@ -123,6 +137,7 @@ class RegionBook:
                 "id": known_id,
                 "reason": known.region.reason.label,
                 "passes": sorted(known.passes),
+                "later": sorted(known.later),
                 "cubes": sorted(known.cubes)[:: max(1, len(known.cubes) // _KEPT_CUBES)],
                 "history": [moment.to_dict() for moment in known.region.history],
                 "line_spacing_mm": _number(known.region.line_spacing_mm),
@@ -175,7 +190,8 @@ class RegionBook:
                 history=history,
                 line_spacing_mm=math.nan if spacing is None else float(spacing),
             )
-            known = _Known(region, cubes, frozenset(map(int, entry["passes"])))
+            passes, later = (frozenset(map(int, entry.get(name, ()))) for name in ("passes", "later"))
+            known = _Known(region, cubes, passes, later)
             (book._resolved if last.status is RegionStatus.RESOLVED else book._known)[region.region_id] = known
         return book
 
@@ -193,20 +209,26 @@ class RegionBook:
         old: _Known,
         region: RescanRegion,
         cubes: set[tuple[int, int, int]],
-        passes: frozenset[int],
+        on_it: frozenset[int],
+        gone: frozenset[int],
         changes: list[Change],
     ) -> _Known:
+        """`on_it` are the passes with points on it now, `gone` those of the ones before that were withdrawn."""
         status, why = old.region.status, ""
+        later = (old.later - gone) | (on_it - old.passes)
         if status is RegionStatus.RESOLVED:
             status, why = RegionStatus.OPEN, "fails again"
-        elif passes - old.passes:
+        elif on_it - old.passes:
             status, why = RegionStatus.RESCANNED, "a later pass was over it, and it fails still"
+        elif status is RegionStatus.RESCANNED and gone & old.later and not later:
+            status, why = RegionStatus.OPEN, _OVER_IS_GONE
         elif region.reason is not old.region.reason:
             why = f"was {old.region.reason.label} before"
         known = _Known(
             replace(region, number=known_id, region_id=known_id, status=old.region.status, history=old.region.history),
             cubes,
-            passes | old.passes,
+            on_it | (old.passes - gone),
+            later,
         )
         return _stepped(known_id, known, status, why, self._version, changes) if why else known
 
@@ -243,6 +265,7 @@ class _Surface:
         counted = np.flatnonzero(snapshot.neighbours > 0)
         self._cube = _cube_rows(snapshot.points_mm[counted])
         self._pass = snapshot.lines.pass_number[snapshot.line[counted]]
+        self.passes = frozenset(np.unique(self._pass).tolist())  # that are in the map, and not withdrawn
         self._open: BoolArray = ~snapshot.settled[counted]
         key = _key(self._cube)
         self._order = np.argsort(key, kind="stable")
@@ -268,7 +291,7 @@ class _Surface:
         return not any(self._open[rows].any() for rows in self._rows(cubes))
 
     def is_there(self, cubes: set[tuple[int, int, int]], region: RescanRegion) -> bool:
-        """True when the cubes still hold points: a withdrawn pass resolves nothing. Untouched surface never had any."""
+        """True when the cubes still hold points; untouched surface never had any."""
         return region.reason is Reason.UNTOUCHED or any(len(rows) for rows in self._rows(cubes))
 
 

@@ -177,9 +177,10 @@ class SessionBook:
 
     def _hold(self, session: LiveSession) -> None:
         """Hold a session open from now on; raises SessionBusy, and closes it, when all are being closed."""
+        desk = PassDesk(session, self._rigs)  # from it the session knows what is to be decided of its passes
         with self._lock:
             if not self._is_closed:
-                self._live[session.row.session_id] = session
+                self._live[session.row.session_id], self._desks[session.row.session_id] = session, (session, desk)
                 return
         session.close()
         raise SessionBusy("the service is being closed")
@@ -270,12 +271,11 @@ class SessionBook:
         return self._opening.get(session_id)
 
     def pass_desk(self, session: LiveSession) -> PassDesk:
-        """The desk where the session's recommended passes are ordered; made when it is first asked for."""
-        with self._lock:
-            known = self._desks.get(session.row.session_id)
-            if known is None or known[0] is not session:
-                known = self._desks[session.row.session_id] = (session, PassDesk(session, self._rigs))
+        """The desk where the passes of a session that is held open are ordered."""
+        known = self._desks.get(session.row.session_id)
+        if known is not None and known[0] is session:
             return known[1]
+        return PassDesk(session, self._rigs)  # it was just let go of, and refuses all
 
     def live(self, session_id: str) -> LiveSession | None:
         """The session if it is held open."""

@@ -35,11 +35,6 @@ class Course:
         return self._state
 
     @property
-    def told(self) -> str | None:
-        """What there is to say of it."""
-        return self.message or self.remark
-
-    @property
     def is_held(self) -> bool:
         """True in a pause that lasts until somebody resumes."""
         return self._is_held

@@ -105,18 +105,18 @@ class Judgement:
             self._left, self._is_as_left = None, False
             self._finder = None  # it knows verdicts by what was asked before
 
-    def renew(self, source: Source, unless: int | None = None, begins: Begins = lambda step: None) -> Results | None:
+    def renew(self, source: Source, only_new: bool = False, begins: Begins = lambda step: None) -> Results | None:
         """Judge the map as it is, seen from that source; None when the engine is gone.
 
-        The verdict in force is the answer while the map is still of version `unless`. Verdicts are reached one after
+        With `only_new` the verdict in force is the answer while the map is as it was. Verdicts are reached one after
         the other, so that map and regions of each are of one version. `begins` hears of each step, see `awaited.STEPS`.
         """
         with self._judging:
-            return self._judge(source, unless, begins)
+            return self._judge(source, only_new, begins)
 
-    def _judge(self, source: Source, unless: int | None, begins: Begins) -> Results | None:
+    def _judge(self, source: Source, only_new: bool, begins: Begins) -> Results | None:
         try:
-            if unless is not None and self._map_version() == unless:
+            if only_new and self._results is not None and self._map_version() == self._results.snapshot.version:
                 return self._results
             begins("reading the map")
             with self._mirroring:

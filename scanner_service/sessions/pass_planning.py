@@ -37,6 +37,15 @@ class PlanQuestion:
     tried: Tried
     standing: Pose | None
     driven: tuple[Driven, ...]
+    ordered: frozenset[int]  # the passes of the map that were ordered, also those that were driven otherwise
+
+    @classmethod
+    def of(
+        cls, orders: Sequence[PassOrder], results: Results, setup: RigSetup, serving: Serving, standing: Pose | None
+    ) -> "PlanQuestion":
+        """What is to be planned for after these orders."""
+        ordered = frozenset(number for order in orders for number in order.map_passes)
+        return cls(results, setup, serving, outcomes_of(orders), tried_by(orders), standing, driven_by(orders), ordered)
 
     def answered(self) -> Plan:
         """The plan. It takes about a second for a large map.
@@ -76,9 +85,9 @@ class PlanQuestion:
     def _looks(self) -> tuple[Look, ...]:
         """The passes whose poses are known: those that were ordered, and the session's own."""
         snapshot, driven, own = self.results.snapshot, list(self.driven), self.setup.scanned_by
-        if isinstance(own, StraightMotion):
-            ordered = {number for number, *_ in driven}
-            for number in sorted(set(snapshot.lines.pass_number.tolist()) - ordered):
+        counted = np.unique(snapshot.lines.pass_number[snapshot.line[snapshot.neighbours > 0]])
+        if isinstance(own, StraightMotion):  # one that was withdrawn has seen nothing, and found nothing empty
+            for number in sorted(set(counted.tolist()) - self.ordered):
                 at = snapshot.lines.position_mm[snapshot.lines.pass_number == number]
                 if len(at) and np.isfinite(at).all():
                     driven.append((number, own, float(at[0]), float(at[-1])))
@@ -126,10 +135,18 @@ def outcomes_of(orders: Sequence[PassOrder]) -> tuple[Outcome, ...]:
 
 
 def driven_by(orders: Sequence[PassOrder]) -> tuple[Driven, ...]:
-    """The passes of the map that were ordered, as they were driven; those that lie elsewhere are left out."""
+    """The passes of the map that were ordered, as they were driven; doubted and withdrawn ones are left out."""
     return tuple(
         (number, order.planned.motion, order.planned.start_mm, order.planned.end_mm)
         for order in orders
-        if order.doubt is None
+        if order.is_in_force
         for number in order.map_passes
     )
+
+
+def tried_by(orders: Sequence[PassOrder]) -> Tried:
+    """What the passes that were carried out to their end were in vain for."""
+    tried = Tried.nothing()
+    for outcome in outcomes_of(orders):
+        tried = tried.and_also(outcome.missed_mm, outcome.empty_mm)
+    return tried

@@ -1,10 +1,13 @@
-"""Whether scans can begin without waiting for a compiler: compiles all once a process, and says how far it is."""
+"""Whether scans can begin without waiting for a compiler: loads or compiles all once a process, says how far it is."""
 
 import gc
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
+
+from numba.core import event
 
 from scanner_service.analysis.compiling import compile_kernels
 from scanner_service.rescan.cuts import compile_cuts
@@ -16,7 +19,7 @@ from scanner_service.sessions.results import judge
 from scanner_service.storage.packing import compile_packing
 
 STEPS = ("the packing of lines", "the live map", "the verdict", "the planner of passes")
-"""What is compiled, in this order."""
+"""What is compiled, or loaded from the cache, in this order."""
 
 _LOCK = threading.Lock()
 _READY = threading.Event()
@@ -24,23 +27,39 @@ _READY = threading.Event()
 
 @dataclass(frozen=True, slots=True)
 class Preparing:
-    """What is being compiled: step `step` of `of`, `seconds` after the beginning of all."""
+    """What is being prepared: step `step` of `of`, `seconds` after the beginning of all.
+
+    `compiles`: something had to be compiled so far, and was not loaded from the cache.
+    """
 
     what: str
     step: int
     of: int
     seconds: float
+    compiles: bool
 
     def __str__(self) -> str:
-        return f"compiling {self.what}, step {self.step} of {self.of}, for {self.seconds:.0f} s now"
+        verb = "compiling" if self.compiles else "loading"
+        return f"{verb} {self.what}, step {self.step} of {self.of}, for {self.seconds:.0f} s now"
 
 
 @dataclass(slots=True)
 class _Course:
-    """How far the compiling is; written by the thread that compiles."""
+    """How far it is; written by the thread that prepares."""
 
     step: int = 0  # of those that are counted from 1; 0 before the first
     begun_s: float = 0.0
+    compiles: bool = False
+
+
+class _Compilations(event.Listener):
+    """Hears of each kernel that is compiled; of those that are loaded nothing is said."""
+
+    def on_start(self, event: Any) -> None:
+        _COURSE.compiles = True
+
+    def on_end(self, event: Any) -> None:
+        pass
 
 
 _COURSE = _Course()
@@ -52,11 +71,11 @@ def kernels_are_ready() -> bool:
 
 
 def preparing(clock: Callable[[], float] = time.monotonic) -> Preparing | None:
-    """What is being compiled just now; None when nothing is."""
+    """What is being compiled or loaded just now; None when nothing is."""
     step, begun_s = _COURSE.step, _COURSE.begun_s
     if _READY.is_set() or not step:
         return None
-    return Preparing(STEPS[step - 1], step, len(STEPS), max(0.0, clock() - begun_s))
+    return Preparing(STEPS[step - 1], step, len(STEPS), max(0.0, clock() - begun_s), _COURSE.compiles)
 
 
 def refuse_until_ready() -> None:
@@ -65,8 +84,8 @@ def refuse_until_ready() -> None:
         told = preparing()
         how_far = f" ({told})" if told is not None else ""
         raise KernelsCompiling(
-            f"the service is not ready yet: after an installation it compiles its kernels once, for a minute or "
-            f"two{how_far}; try again in a moment, GET /readyz says when"
+            f"the service is not ready yet: it loads its kernels, which after an installation are compiled once, for a "
+            f"minute or two{how_far}; try again in a moment, GET /readyz says when"
         )
 
 
@@ -82,14 +101,15 @@ def warm_up() -> None:
         _COURSE.step, _COURSE.begun_s = 1, time.monotonic()
         try:
             mark_used()
-            compile_packing()
-            _COURSE.step = 2
-            snapshot = compile_kernels()
-            _COURSE.step = 3
-            compile_cuts()
-            report = judge(snapshot, Requirement()).report
-            _COURSE.step = 4
-            compile_planner(snapshot, report)
+            with event.install_listener("numba:compile", _Compilations()):
+                compile_packing()
+                _COURSE.step = 2
+                snapshot = compile_kernels()
+                _COURSE.step = 3
+                compile_cuts()
+                report = judge(snapshot, Requirement()).report
+                _COURSE.step = 4
+                compile_planner(snapshot, report)
         finally:
             _COURSE.step = 0
         mark_used()  # it may not have been there before

@@ -19,6 +19,7 @@ from scanner_service.rescan.reference import (
 )
 from scanner_service.rescan.region import RescanRegion
 from scanner_service.rescan.regions import RegionReport, find_regions
+from scanner_service.rescan.remarks import remarks_on
 from scanner_service.rescan.requirement import Requirement
 
 
@@ -37,6 +38,7 @@ class Results:
     `regions` are those of the report, followed through the session: with ids, status and history, by falling priority;
     `resolved` those that were mended. `reference` is the coverage of the nominal part, None without one, or as long as
     there are too few points, or when `reference_refused` says why it cannot be told; `nominal` is that part itself.
+    `remarks` say what of the requirement cannot be met by such a scan, or lies beside it.
     """
 
     snapshot: MapSnapshot
@@ -48,6 +50,7 @@ class Results:
     reference: ReferenceCoverage | None = None
     reference_refused: str | None = None
     nominal: ReferenceSurface | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -71,6 +74,11 @@ class Results:
         return float(np.median(known)) if len(known) else math.nan
 
     @property
+    def said(self) -> tuple[str, ...]:
+        """What somebody should be told of what is asked for."""
+        return self.remarks if self.reference_refused is None else (self.reference_refused, *self.remarks)
+
+    @property
     def holds(self) -> bool | None:
         """Whether the coverage asked for is reached; None when none is asked for, or none is known."""
         asked = self.requirement.coverage_share
@@ -80,6 +88,7 @@ class Results:
         """For JSON: the report, with the regions as they are followed."""
         return self.report.to_dict() | {
             "requirement": self.requirement.to_dict(),
+            "remarks": list(self.remarks),
             "regions": [region.to_dict() for region in self.regions],
             "resolved": [region.to_dict() for region in self.resolved],
         }
@@ -142,6 +151,7 @@ def conclude(
         reference=measured,
         reference_refused=refused,
         nominal=reference,
+        remarks=remarks_on(requirement, snapshot),
     )
 
 
@@ -154,7 +164,7 @@ def summarise(
 ) -> dict[str, Any]:
     """The content of summary.json: lengths in millimetres, densities in points/mm2, NaN for what is not known."""
     snapshot = results.snapshot
-    return _of_points(snapshot, losses, version, notes) | {
+    return _of_points(snapshot, losses, version, (*notes, *results.remarks)) | {
         "scanlines": len(snapshot.lines),
         "line_spacing_mm": _spread(snapshot.lines.line_spacing_mm),
         "point_spacing_mm": _spread(snapshot.lines.point_spacing_mm),

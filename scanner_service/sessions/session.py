@@ -28,7 +28,7 @@ from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source import Pausable, Source, look_as_before
-from scanner_service.sessions.status import Status, durable_told
+from scanner_service.sessions.status import Status, durable_told, first_said
 from scanner_service.sessions.still_sources import PushSource
 from scanner_service.sessions.terms import Terms
 from scanner_service.sessions.updates import Changes, PointPage, VerdictBook, changes_since, read_page
@@ -62,11 +62,11 @@ class LiveSession:
             self.engine, self.verdicts, self.settings.requirement(), nominal, self._chronicle.event, clock
         )
         self.hearing = Hearing(self.engine, self._course, self._chronicle.event, self._stop_source, self._finish)
+        self.doubted: str | None = None  # what is to be decided of its passes; told by whoever keeps their orders
         self._awaited = AwaitedVerdict(clock)
         self._closing = threading.Event()
         self._is_closing = False
         self._wires = Wires(source)
-        self._judged_version = -1  # of the map, by the analyst
         self._analyst = Analyst(
             row.session_id,
             self._closing,
@@ -338,12 +338,14 @@ class LiveSession:
             progress=self.source.progress(),
             losses=self.losses(),
             durable=durable_told(self._record.watermark(self.row.session_id)),
-            message=(
-                self.engine.failure
-                or self._chronicle.trouble()
-                or self._analyst.failure
-                or self._course.told
-                or (results.reference_refused if results else None)
+            message=first_said(
+                self.engine.failure,
+                self._chronicle.trouble(),
+                self._analyst.failure,
+                self._course.message,
+                self.doubted,
+                self._course.remark,
+                *(results.said if results else ()),
             ),
             held=self._course.is_held,
             holds=results.holds if results is not None else None,
@@ -394,6 +396,4 @@ class LiveSession:
 
     def _judge_what_is_new(self) -> None:
         if self._course.is_under_way or self.results() is None:
-            results = self._judgement.renew(self.source, self._judged_version)
-            if results is not None:
-                self._judged_version = results.snapshot.version
+            self._judgement.renew(self.source, only_new=True)

@@ -46,3 +46,8 @@ def durable_told(marks: Mapping[str, Watermark]) -> dict[str, dict[str, int]]:
         device: {"boot_id": mark.boot_id, "line_index": mark.line_index, "lines": mark.line_count}
         for device, mark in marks.items()
     }
+
+
+def first_said(*said: str | None) -> str | None:
+    """Of what there is to say, the most urgent first, the one sentence that is said."""
+    return next(filter(None, said), None)

@@ -1,6 +1,7 @@
 """Passes that are taken out of the map, and passes that were closed and when, as the record's events tell it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.engine import Engine
@@ -29,11 +30,12 @@ def withdraw(record: Record, engine: Engine, key: PassKey) -> int:
 
 def withdrawn_passes(events: Iterable[EventRow]) -> set[PassKey]:
     """The passes that the events withdraw."""
-    return {
-        (str(event.details["device_id"]), int(event.details["boot_id"]), int(event.details["pass_index"]))
-        for event in events
-        if event.kind == WITHDRAWN and not event.damaged
-    }
+    return {key_of(event.details) for event in events if event.kind == WITHDRAWN and not event.damaged}
+
+
+def key_of(named: Mapping[str, Any]) -> PassKey:
+    """A pass that is named in JSON; raises KeyError, TypeError, ValueError when none is."""
+    return str(named["device_id"]), int(named["boot_id"]), int(named["pass_index"])
 
 
 def ends_of_passes(events: Iterable[EventRow]) -> list[int]:

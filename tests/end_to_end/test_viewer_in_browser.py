@@ -153,6 +153,9 @@ class StandIn:
             problem = {"type": "about:blank", "title": "Conflict", "status": 409, "detail": "the stage is still moving"}
             return JSONResponse(problem, 409, media_type="application/problem+json")
 
+        async def ready(_: Request) -> Response:
+            return JSONResponse({"checks": {"kernels": True}, "preparing": None})
+
         async def orders(_: Request) -> Response:
             return JSONResponse({"orders": []})
 
@@ -165,6 +168,7 @@ class StandIn:
         return Starlette(
             routes=[
                 Route("/", page),
+                Route("/readyz", ready),
                 Mount("/static", StaticFiles(directory=STATIC_DIR)),
                 Route(base, listing),
                 Route(f"{base}/{{id}}/pass-orders", orders),

@@ -125,12 +125,14 @@ def test_a_live_scan_never_shrinks_and_ends_as_the_service_has_it(running: Any, 
     page.tab.fill("#ask-density_per_mm2", "200")  # of all that was scanned: no region stays as it was
     page.tab.click("#requirement-apply")
     page.until("document.querySelector('#requirement-said').textContent.startsWith('200 points/mm²')")
+    page.until("document.querySelector('#judging-text').textContent.match(/^Judged: [0-9]+ region/)")
     page.until("viewer.regions > 0 && viewer.connection === 'finished'")
     now = regions_of(service, session_id)
     assert [int(number) for number in page.tab.locator("#regions .number").all_text_contents()] == [
         one["id"] for one in now
     ]
-    assert page.tab.locator("#regions .density").all_text_contents()[0].endswith("≥ 200points/mm²")
+    said = page.tab.locator("#regions .density").all_text_contents()
+    assert lost or said[0].endswith("≥ 200points/mm²")  # lines that were lost are missed first, by their spacing
     assert page.complaints == []
     page.tab.close()
 
@@ -231,7 +233,7 @@ def test_the_page_starts_a_session_misses_a_service_that_ends_and_finds_it_again
             page.until("document.querySelector('#session-state').textContent === 'interrupted'")
             page.until("document.querySelector('#message').hidden")
             assert page.text("#start") == "Go on"
-            assert elsewhere.complaints == []
+            assert [said for said in elsewhere.complaints if "503" not in said] == []  # it asked whether all is ready
         finally:
             again.terminate()
     page.tab.close()
@@ -376,5 +378,19 @@ def test_what_is_asked_for_is_set_on_the_page_and_a_hand_is_guided_along_the_pas
     assert "promised" in page.text("#orders .pass:first-child").lower()
     refused = service.client.get(f"{where}/pass-orders/{order['order']}/guidance")
     assert (refused.status_code, "is done" in refused.json()["detail"]) == (409, True)
+
+    before = service.status(session_id)["points"]
+    page.until("document.querySelector('#plan-note').textContent === ''")
+    withdraw = page.tab.locator("#orders .pass:first-child button")
+    withdraw.focus()
+    page.tab.keyboard.press("Enter")
+    assert withdraw.text_content() == "Press again: its points leave the map"
+    page.tab.keyboard.press("Escape")
+    assert withdraw.text_content() == "Withdraw"
+    for _ in range(2):
+        page.tab.keyboard.press("Enter")
+    page.until("document.querySelector('#orders .badge')?.textContent === 'withdrawn'")
+    assert service.status(session_id)["points"] < before - 1000
+    assert "reached" not in page.text("#orders .pass:first-child")
     assert [complaint for complaint in page.complaints if "422" not in complaint and "409" not in complaint] == []
     page.tab.close()

@@ -24,7 +24,8 @@ async def healthz() -> Response:
 async def readyz(request: Request) -> Response:
     """Ready when the kernels are compiled and the record takes lines; 503 until then.
 
-    `preparing` says what is being compiled: `what`, `step` of how many (`of`), and the `seconds` since it began.
+    `preparing` says what is being loaded, or compiled (`compiles`): `what`, `step` of how many (`of`), and since how
+    many `seconds`.
     """
     service = request.app.state.service
     checks = {"kernels": service.kernels_ready, "record": service.book.record.writer_state().state == "ok"}

@@ -8,7 +8,8 @@ from starlette.responses import Response
 
 from scanner_service.api.answers import answer
 from scanner_service.api.pass_schemas import AcceptIn, CarryOutIn, LoopIn, ReasonName, RegionId, RigIn, serving_of
-from scanner_service.api.routes.sessions import Session, book_of, operator, viewer
+from scanner_service.api.routes.sessions import Session, book_of, operator, status_answer, viewer
+from scanner_service.api.schemas import PassIn
 from scanner_service.rescan.passes.serving import Serving
 from scanner_service.sessions.pass_desk import PassDesk
 from scanner_service.sessions.pass_planning import name_of
@@ -90,6 +91,28 @@ def carry_out(desk: Desk, order: int, body: CarryOutIn = CarryOutIn()) -> Respon
 def cancel_order(desk: Desk, order: int) -> Response:
     """Give up an accepted pass that was not carried out, at once; it stays in the list, as cancelled."""
     return answer(desk.cancel(order).to_dict())
+
+
+@router.post("/pass-orders/{order}/withdraw", dependencies=[operator])
+def withdraw_order(desk: Desk, order: int) -> Response:
+    """Take what an accepted pass has scanned out of the map: it is `withdrawn`, and may be planned again.
+
+    Its lines stay in the record. The answer comes when all is judged anew.
+    """
+    return answer(desk.withdraw(order).to_dict())
+
+
+@router.post("/pass-orders/{order}/keep", dependencies=[operator])
+def keep_order(desk: Desk, order: int) -> Response:
+    """Count what a doubted pass has brought after all: somebody who has looked says that it lies where it should."""
+    return answer(desk.keep(order).to_dict())
+
+
+@router.post("/passes/withdraw", dependencies=[operator])
+def withdraw_pass(session: Session, desk: Desk, body: PassIn) -> Response:
+    """Take a pass out of the map, as if it had never been scanned. Its raw lines stay in the record."""
+    points = desk.withdraw_pass((body.device_id, body.boot_id, body.pass_index))
+    return answer({**status_answer(session), "withdrawn_points": points})
 
 
 @router.get("/pass-orders/{order}/guidance", dependencies=[viewer])

@@ -17,7 +17,6 @@ from scanner_service.api.keys import Role
 from scanner_service.api.schemas import (
     DescriptionIn,
     DeviceSourceIn,
-    PassIn,
     PushSourceIn,
     ReferenceIn,
     ReplaySourceIn,
@@ -248,6 +247,7 @@ def _requirement_answer(session: LiveSession) -> dict[str, Any]:
         "coverage": status.coverage,
         "coverage_kind": status.coverage_kind,
         "reference_refused": None if results is None else results.reference_refused,
+        "remarks": [] if results is None else results.remarks,
     }
 
 
@@ -313,13 +313,6 @@ def stop_session(session: Session) -> Response:
     """Stop the scan, close its passes and judge it; the answer comes when the verdict is there."""
     session.stop()
     return answer(status_answer(session))
-
-
-@router.post("/{session_id}/passes/withdraw", dependencies=[operator])
-def withdraw_pass(session: Session, body: PassIn) -> Response:
-    """Take a pass out of the map, as if it had never been scanned. Its raw lines stay in the record."""
-    points = session.withdraw_pass((body.device_id, body.boot_id, body.pass_index))
-    return answer({**status_answer(session), "withdrawn_points": points})
 
 
 @router.delete("/{session_id}", status_code=204, dependencies=[admin])

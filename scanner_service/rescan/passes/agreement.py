@@ -61,7 +61,7 @@ class Agreement:
         )
         return (
             f"only {self.share:.0%} of the points that should lie on surface known before are within "
-            f"{self.within_mm:.1f} mm of it: {asked} If so, withdraw this pass and scan it again"
+            f"{self.within_mm:.1f} mm of it: {asked}"
         )
 
     def to_dict(self) -> dict[str, object]:

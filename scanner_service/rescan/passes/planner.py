@@ -23,7 +23,7 @@ from scanner_service.rescan.passes.recommendation import Plan, Promise, Recommen
 from scanner_service.rescan.passes.serving import EVERYTHING, Serving
 from scanner_service.rescan.passes.stretch import Stretch
 from scanner_service.rescan.passes.tried import Tried
-from scanner_service.rescan.passes.unreachable import in_vain, lost_regions, unreachable
+from scanner_service.rescan.passes.unreachable import lost_regions, unreachable
 from scanner_service.rescan.passes.visibility import APART_RAD, look_around
 from scanner_service.rescan.reference import ReferenceCoverage
 from scanner_service.rescan.region import RescanRegion
@@ -119,7 +119,7 @@ def plan_passes(
     if not (passes or wishes.tops_up) and (report.reason == Reason.STEEP).any():
         last = replace(wishes, tops_up=True)
         return plan_passes(snapshot, report, reach, optics, last, standing, tried, looks, regions, reference)
-    lost = unreachable(needs, cover.reachable, cover.attitudes, sky, optics) + in_vain(given_up, needs)
+    lost = unreachable(needs, cover.reachable, cover.attitudes, sky, optics, given_up, regions)
     needed = float(needs.gain_mm2.sum() + given_up.gain_mm2.sum())
     asked = frozenset(np.unique(needs.region[cover.reachable]).tolist()) - {UNSEEN}
     return Plan(report.version, tuple(passes), lost, needed, asked, lost_regions(lost))

@@ -181,7 +181,12 @@ class RecommendedPass:
 
 @dataclass(frozen=True, slots=True)
 class Unreachable:
-    """Surface of one region that no pass within the limits can bring, and why."""
+    """Surface of one region that no pass within the limits can bring, and why.
+
+    `share` of what is wanted of the region, and `area_mm2` that share of its area: a region whose surface is out of
+    reach for several reasons has several, and what they leave of it can be reached. Surface outside of any region
+    (UNSEEN) is told as large as it is guessed where hidden space begins.
+    """
 
     region: int
     area_mm2: float

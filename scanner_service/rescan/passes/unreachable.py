@@ -1,6 +1,7 @@
 """Which of the needs no attitude of the rig can bring, and why; plans nothing."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from scanner_service.rescan.passes.reach import Attitude
 from scanner_service.rescan.passes.recommendation import Unreachable
 from scanner_service.rescan.passes.tried import TRIES
 from scanner_service.rescan.passes.visibility import OpenSky
+from scanner_service.rescan.region import RescanRegion
 
 _ALL = 0.98
 """Share of what is wanted of a region that is out of reach, from which on nothing of it can be brought."""
@@ -19,12 +21,43 @@ Whys = np.ndarray[tuple[int], np.dtype[np.object_]]
 
 
 def unreachable(
-    needs: Needs, reachable: BoolArray, attitudes: tuple[Attitude, ...], sky: OpenSky, optics: ScannerOptics
+    needs: Needs,
+    reachable: BoolArray,
+    attitudes: tuple[Attitude, ...],
+    sky: OpenSky,
+    optics: ScannerOptics,
+    given_up: Needs,
+    regions: Sequence[RescanRegion],
 ) -> tuple[Unreachable, ...]:
-    """The needs that no attitude sees, by region and reason; `reachable` (n,) are those that one sees."""
-    missing = ~reachable
-    if not missing.any():
+    """What no attitude sees, and what passes were to see in vain, by region and reason, the largest first.
+
+    Parameters
+    ----------
+    reachable : (n,) those of the `needs` that some attitude sees.
+    given_up : further needs, that were promised in vain so often that they are not wanted any more.
+    regions : of a region the share of its needs that are out of reach is told as that share of its area, so that the
+        parts of one region never add up to more than it; surface outside of any is told as large as it is guessed.
+    """
+    if reachable.all() and not len(given_up):
         return ()
+    region = np.concatenate([needs.region, given_up.region])
+    area_mm2 = np.concatenate([needs.area_mm2, given_up.area_mm2])
+    in_vain = f"{TRIES} passes that should have seen it brought no returns"
+    why = np.concatenate([_why(needs, attitudes, sky, optics), np.full(len(given_up), in_vain, dtype=object)])
+    missing = np.concatenate([~reachable, np.ones(len(given_up), dtype=np.bool_)])
+    known_mm2 = {one.number: one.area_mm2 for one in regions}
+    found = []
+    for number in np.unique(region[missing]).tolist():
+        of_region = region == number
+        whole_mm2 = float(area_mm2[of_region].sum())
+        for reason in sorted(set(why[missing & of_region])):
+            share = float(area_mm2[missing & of_region & (why == reason)].sum()) / whole_mm2
+            found.append(Unreachable(number, share * known_mm2.get(number, whole_mm2), share, str(reason)))
+    return tuple(sorted(found, key=lambda one: -one.area_mm2))
+
+
+def _why(needs: Needs, attitudes: tuple[Attitude, ...], sky: OpenSky, optics: ScannerOptics) -> Whys:
+    """(n,) why each need is out of reach, if it is."""
     why = np.full(len(needs), "no pass within the rig's limits reaches it with laser and camera", dtype=object)
     faced, lit = np.zeros(len(needs), dtype=np.bool_), np.zeros(len(needs), dtype=np.bool_)
     laser = optics.geometry.laser_mm / np.linalg.norm(optics.geometry.laser_mm)
@@ -38,13 +71,7 @@ def unreachable(
     why[~faced] = f"the rig cannot face it within {degrees:.0f}° of its normal"
     why[faced & ~lit] = "the part itself hides it from the laser wherever the rig can stand"
     why[faced & lit] = "where the laser reaches it, the part hides it from the camera or the rig ends"
-    return _by_region(needs, needs, missing, why)
-
-
-def in_vain(given_up: Needs, needs: Needs) -> tuple[Unreachable, ...]:
-    """The needs that were given up, by region; `needs` are those that were not."""
-    why = np.full(len(given_up), f"{TRIES} passes that should have seen it brought no returns", dtype=object)
-    return _by_region(given_up, needs, np.ones(len(given_up), dtype=np.bool_), why)
+    return why
 
 
 def lost_regions(found: tuple[Unreachable, ...]) -> dict[int, str]:
@@ -55,17 +82,3 @@ def lost_regions(found: tuple[Unreachable, ...]) -> dict[int, str]:
         shares[one.region] = shares.get(one.region, 0.0) + one.share
         whys[one.region] = one.why
     return {region: whys[region] for region, share in shares.items() if region and share >= _ALL}
-
-
-def _by_region(needs: Needs, others: Needs, which: BoolArray, why: Whys) -> tuple[Unreachable, ...]:
-    found = []
-    for region in np.unique(needs.region[which]):
-        of_region = needs.region == region
-        whole = float(needs.area_mm2[of_region].sum())
-        if others is not needs:
-            whole += float(others.area_mm2[others.region == region].sum())
-        for reason in sorted(set(why[which & of_region])):
-            area = float(needs.area_mm2[which & of_region & (why == reason)].sum())
-            found.append(Unreachable(int(region), area, area / whole, str(reason)))
-    found.sort(key=lambda one: -one.area_mm2)
-    return tuple(found)

@@ -22,7 +22,7 @@ export class Guide {
     if (wanted === this.#followed) return;
     this.#followed = wanted;
     clearTimeout(this.#timer);
-    this.place.hidden = order === null;
+    this.place.hidden = true; // until there is something to say
     this.onPlace(null);
     if (order !== null) this.#look(session, order, wanted);
   }
@@ -46,6 +46,7 @@ export class Guide {
     const length = Math.abs(order.pass.end_mm - order.pass.start_mm);
     const share = told && !missing(told.along_mm) ? Math.min(1, Math.max(0, 1 - told.along_mm / length)) : null;
     const figure = (name, value, unit) => element("div", {}, element("dt", {}, name), element("dd", {}, fixed(value, 1), element("span.unit", {}, unit)));
+    this.place.hidden = false;
     this.place.replaceChildren(
       element("p.say", {}, opening(said)),
       ...(told

@@ -5,6 +5,7 @@ import { byId, element } from "./element.js";
 import { ExportMenu } from "./exports.js";
 import { freeAreas } from "./free_areas.js";
 import { drawRuler, drawTriad } from "./gauges.js";
+import { untilReady } from "./getting_ready.js";
 import { Guide } from "./guide.js";
 import { InterestBox } from "./interest_box.js";
 import { listenToKeys } from "./keyboard.js";
@@ -52,7 +53,7 @@ const guide = new Guide(byId("guide"), (share) => {
   arrow.at(share);
   view.invalidate();
 });
-const passes = new PassesPanel({ trouble, scanned: () => session.open(session.id), onOrder: followOrder, onPass: (pass) => showPass(pass ?? ordered?.pass ?? null) });
+const passes = new PassesPanel({ trouble, scanned: () => session.renew(), onOrder: followOrder, onPass: (pass) => showPass(pass ?? ordered?.pass ?? null) });
 const judging = new JudgingNote(() => session.regions);
 const awaiting = {
   onAsked: () => judging.ask(),
@@ -60,7 +61,7 @@ const awaiting = {
   onRefused: () => judging.open(),
   onJudged: () => {
     judging.answered();
-    if (connectionState === "finished") session.open(session.id); // nothing more comes by itself
+    if (connectionState === "finished") session.renew(); // nothing more comes by itself
   },
 };
 const requirement = new RequirementPanel({ onInterest: showInterest, partBox, ...awaiting });
@@ -395,4 +396,4 @@ globalThis.viewer = Object.freeze({
 listen();
 drawFigures(byId("figures"), null, session.store, null);
 applyLook();
-picker.begin(new URLSearchParams(location.search).get("session"));
+untilReady(notice).then(() => session.id ?? picker.begin(new URLSearchParams(location.search).get("session")));

@@ -8,7 +8,7 @@ import { reasonByKey, RESCAN_REASONS, rescanReason, STATE_ISOLATED, STATE_NOT_CO
 
 const figure = (name, value, unit = null) => element("div", {}, element("dt", {}, name), element("dd", {}, value, unit === null ? null : element("span.unit", {}, unit)));
 
-const UNDER_WAY = new Set(["scanning", "paused"]);
+export const UNDER_WAY = new Set(["scanning", "paused"]);
 
 // Nobody knows of the surface that a scan has still to come to, unless there is a nominal part.
 export function coverageName(status) {
@@ -16,7 +16,10 @@ export function coverageName(status) {
   return UNDER_WAY.has(status?.state) ? "Coverage so far" : "Observed coverage";
 }
 
-export const noRegions = (status) => (UNDER_WAY.has(status?.state) ? "No region of the surface seen so far needs another scan." : "No region needs another scan.");
+export function noRegions(status) {
+  if (UNDER_WAY.has(status?.state)) return "No region of the surface seen so far needs another scan.";
+  return status?.coverage === null ? "Nothing was judged." : "No region needs another scan."; // such as where all lies outside of what is of interest
+}
 
 export function drawFigures(place, status, store, box) {
   const size = box ? box.high.map((high, axis) => significant(high - box.low[axis])).join(" × ") : "–";

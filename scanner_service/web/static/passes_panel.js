@@ -1,8 +1,9 @@
 // Recommended passes beside the picture: the list, buttons to accept and carry out, and what became of each order.
 
 import { byId, element } from "./element.js";
-import { plural, sentence, significant, whole, words } from "./numbers.js";
-import { acceptPass, cancelOrder, carryOut, endLoop, listOrders, listPasses, loopState, startLoop } from "./service.js";
+import { percent, plural, sentence, significant, whole, words } from "./numbers.js";
+import { pressedTwice } from "./second_press.js";
+import { acceptPass, cancelOrder, carryOut, endLoop, keepOrder, listOrders, listPasses, loopState, startLoop, withdrawOrder } from "./service.js";
 
 const FOLLOW_MS = 1000;
 const SAY_MS = 500;
@@ -31,8 +32,14 @@ export function foretold({ promised_mm2, promised_between_mm2, explores_mm2, exp
   return `${[promised, explores].filter(Boolean).join(", ")} mm²`;
 }
 
+// Surface that no pass brings: as much of its region as this reason holds for, or of the guess where none lists it.
+export const outOfReach = ({ region, area_mm2, share, why }) =>
+  `Unreachable: ${significant(area_mm2, 2)} mm² ${region === null ? "outside of any region, as guessed" : `of region ${region}`} (${percent(share)} of what is wanted there): ${why}`;
+
 // What became of an order that is over, in words; "" while nothing has.
 export function fate({ status, message, outcome, reached_end: whole }) {
+  if (status === "doubted") return ["nothing of it is counted until you withdraw or keep it", message].filter(Boolean).join("; ");
+  if (status === "withdrawn") return "its points are out of the map; the lines stay in the record";
   const said = outcome && !(outcome.promised_mm2 < 0.5 && outcome.expected_mm2 >= 1) ? `promised ${area(outcome.promised_mm2, outcome.promised_between_mm2)}, reached ${significant(outcome.reached_mm2)} mm²` : "";
   const explored = outcome?.expected_mm2 >= 1 ? `explored: ${significant(outcome.found_mm2)} found, ${area(outcome.expected_mm2, outcome.expected_between_mm2)} mm² expected` : "";
   const early = status === "done" && whole === false ? "ended before its end" : "";
@@ -66,6 +73,10 @@ export class PassesPanel {
     byId("end-loop").addEventListener("click", () => this.#act(() => endLoop(this.#id)));
   }
 
+  get #isUnderWay() {
+    return this.#orders.some(({ status }) => status === "running");
+  }
+
   open(id) {
     this.#id = id;
     this.#state = null;
@@ -94,13 +105,15 @@ export class PassesPanel {
     clearTimeout(this.#timer);
     try {
       const [{ orders }, { loop }] = [await listOrders(id), await loopState(id)];
+      if (id !== this.#id || asked !== this.#asked) return;
+      const wasRunning = this.#isUnderWay;
+      this.#orders = orders;
+      const isRunning = this.#isUnderWay;
+      this.#draw(orders, loop); // at once, whatever becomes of the plan
+      if (wasRunning !== isRunning) this.scanned();
       const plan = withPlan ? await this.#planned(id) : null;
       if (id !== this.#id || asked !== this.#asked) return;
-      const wasRunning = this.#orders.some((order) => order.status === "running");
-      const isRunning = orders.some((order) => order.status === "running");
-      this.#orders = orders;
-      this.#draw(plan, orders, loop);
-      if (wasRunning !== isRunning) this.scanned();
+      if (plan) this.#drawPlan(plan);
       if (loop?.running || isRunning) this.#timer = setTimeout(() => this.#refresh(false), FOLLOW_MS);
       else if (wasRunning) this.#refresh(true); // what it brought changes what is worth another one
     } catch (refusal) {
@@ -108,11 +121,15 @@ export class PassesPanel {
     }
   }
 
-  // The plan, which may take a while on a busy computer: that it is being made stays in sight until it is there.
+  // The plan, which may take a while on a busy computer: that it is being made stays in sight until it is there. Null, and
+  // why, when there is none: orders are followed all the same.
   async #planned(id) {
     this.#saysPlanning(true);
     try {
       return await listPasses(id);
+    } catch (refusal) {
+      if (id === this.#id) this.trouble(refusal.message);
+      return null;
     } finally {
       if (id === this.#id) this.#saysPlanning(false);
     }
@@ -142,14 +159,17 @@ export class PassesPanel {
     await this.#refresh(true);
   }
 
-  #draw(plan, orders, loop) {
-    if (plan !== null) {
-      byId("passes-count").textContent = String(plan.passes.length);
-      const none = element("li.empty", {}, "Nothing that this rig reaches would be a gain.");
-      byId("passes").replaceChildren(...(plan.passes.length ? plan.passes.map((one) => this.#pass(one, plan.plan)) : [none]));
-      this.onPass(null);
-    }
+  #drawPlan({ plan, passes, unreachable }) {
+    byId("passes-count").textContent = String(passes.length);
+    const none = element("li.empty", {}, "Nothing that this rig reaches would be a gain.");
+    byId("passes").replaceChildren(...(passes.length ? passes.map((one) => this.#pass(one, plan)) : [none]), ...unreachable.map((one) => element("li.small", {}, outOfReach(one))));
+    this.onPass(null);
+  }
+
+  #draw(orders, loop) {
+    const focused = document.activeElement?.closest("#orders [data-order]")?.dataset.order;
     byId("orders").replaceChildren(...orders.toReversed().map((order) => this.#order(order)));
+    if (focused) byId("orders").querySelector(`[data-order="${focused}"] button`)?.focus();
     this.onOrder(orders.findLast(({ status }) => status === "running") ?? orders.findLast(({ status }) => status === "accepted") ?? null);
     byId("end-loop").hidden = !loop?.running;
     byId("run-loop").hidden = Boolean(loop?.running);
@@ -170,6 +190,15 @@ export class PassesPanel {
     );
   }
 
+  // Withdrawing is there wherever it can be done, keeping where somebody has to say which.
+  #decisions({ order: number, status, passes }) {
+    if (!["done", "failed", "doubted"].includes(status) || !passes.length || this.#isUnderWay) return null;
+    const said = { says: "Withdraw", asks: "Press again: its points leave the map", does: "Withdrawing…", title: "Take what this pass has scanned out of the map, such as when the part was not turned" };
+    const withdraw = pressedTwice(said, () => this.#act(() => withdrawOrder(this.#id, number).then(this.scanned)));
+    const keep = element("button.quiet", { type: "button", title: "The part lies as the pass asks: count what it has brought", onclick: () => this.#act(() => keepOrder(this.#id, number)) }, "Keep");
+    return element("span.row", {}, withdraw, status === "doubted" ? keep : null);
+  }
+
   #order(order) {
     const { order: number, status, pass } = order;
     const go = () => this.#act(() => carryOut(this.#id, number, pass.turn_part !== null));
@@ -182,7 +211,8 @@ export class PassesPanel {
       element("span", {}, ...way(pass)),
       waits && pass.turn_part ? element("span", {}, `First: ${pass.turn_part}.`) : null,
       said ? element("span", {}, sentence(said)) : null,
-      order.outcome?.doubt ? element("span.doubt", { role: "alert" }, `Warning: ${order.outcome.doubt}.`) : null,
+      status === "doubted" ? element("span.doubt", { role: "alert" }, sentence(order.outcome.doubt)) : null,
+      this.#decisions(order),
       waits
         ? element(
             "span.row",

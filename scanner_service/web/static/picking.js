@@ -1,6 +1,6 @@
 // Which point lies under the pointer: the nearest to the eye among those close by; plain arrays, no three, no page.
 
-import { ABSENT } from "./point_store.js";
+import { isShown } from "./point_store.js";
 
 // `matrix` is clip_from_part, 16 numbers column by column; x, y and the radius are CSS pixels from the top left corner.
 // The row of the point, or -1. A point `slack` of the view's depth behind another one loses to it.
@@ -9,7 +9,7 @@ export function pickPoint({ xyz, state, end }, matrix, width, height, x, y, radi
   const candidates = [];
   let nearest = Infinity;
   for (let row = 0; row < end; row += 1) {
-    if (state[row] === ABSENT) continue;
+    if (!isShown(state[row])) continue;
     const px = xyz[3 * row];
     const py = xyz[3 * row + 1];
     const pz = xyz[3 * row + 2];

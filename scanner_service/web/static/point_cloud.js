@@ -21,7 +21,7 @@ out vec3 tint;
 const vec3 UNRELIABLE = vec3(0.47, 0.48, 0.50);
 
 void main() {
-  if (state == 0xffffffffu || any(isnan(position))) {  // not received yet: outside of every view
+  if ((state & 16u) != 0u || any(isnan(position))) {  // not counted, or not received yet: outside of every view
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
     gl_PointSize = 0.0;
     return;

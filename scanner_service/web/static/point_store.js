@@ -1,10 +1,13 @@
 // Every point of the map this page has been told, in arrays that grow by doubling; draws nothing and hears no socket.
 
-import { STATE_SETTLED } from "./stream_format.js";
+import { STATE_NOT_COUNTED, STATE_SETTLED } from "./stream_format.js";
 
 export const ABSENT = 0xffffffff; // the state of a row that no message has brought yet
 const BLOCK_ROWS = 1024; // changes are remembered in blocks, so that scattered rows cost few uploads
 const FIRST_CAPACITY = 1 << 16;
+
+// Whether a point is in the picture: one that is not counted (withdrawn, stationary, over-dense) is not, nor one that is absent.
+export const isShown = (state) => (state & STATE_NOT_COUNTED) === 0;
 
 // A message builds on a version this store does not hold; only a full snapshot can mend it.
 export class VersionGap extends Error {}
@@ -107,7 +110,7 @@ export class PointStore {
     const low = [Infinity, Infinity, Infinity];
     const high = [-Infinity, -Infinity, -Infinity];
     for (let row = 0; row < this.end; row += 1) {
-      if (this.state[row] === ABSENT) continue;
+      if (!isShown(this.state[row])) continue;
       for (let axis = 0; axis < 3; axis += 1) {
         const value = this.xyz[3 * row + axis];
         if (value < low[axis]) low[axis] = value;
@@ -124,7 +127,7 @@ export class PointStore {
     const all = [];
     for (let row = 0; row < this.end; row += stride) {
       const density = this.density[row];
-      if (this.state[row] === ABSENT || !(density > 0)) continue;
+      if (!isShown(this.state[row]) || !(density > 0)) continue;
       all.push(density);
       if (this.state[row] & STATE_SETTLED) settled.push(density);
     }

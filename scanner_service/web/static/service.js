@@ -26,6 +26,13 @@ async function answer(path, options) {
 
 const sessionPath = (id, rest) => `api/v1/sessions/${encodeURIComponent(id)}/${rest}`;
 
+// {checks, preparing}: whether sessions can be opened, and what is still being done for that.
+export const readiness = () =>
+  answer("readyz").catch((refusal) => {
+    if (refusal.status === 503 && refusal.body?.checks) return refusal.body;
+    throw refusal;
+  });
+
 // {sessions, next}: one page of sessions; `next` goes into `after` for the following page, null when there is none.
 export const listSessions = (after = null) => answer(`api/v1/sessions${after === null ? "" : `?after=${encodeURIComponent(after)}`}`);
 
@@ -95,6 +102,12 @@ export const measureAgainst = (id, file, units) => (file === null ? answer(sessi
 export const acceptPass = (id, number, plan) => send(sessionPath(id, `recommended-passes/${number}/accept`), { plan });
 
 export const cancelOrder = (id, order) => answer(sessionPath(id, `pass-orders/${order}`), { method: "DELETE" });
+
+// Take what an order has scanned out of the map; answered when all is judged anew.
+export const withdrawOrder = (id, order) => answer(sessionPath(id, `pass-orders/${order}/withdraw`), { method: "POST" });
+
+// Count what a doubted order has brought after all.
+export const keepOrder = (id, order) => answer(sessionPath(id, `pass-orders/${order}/keep`), { method: "POST" });
 
 // Where the scanner is beside a pass that a hand scans: {along_mm, aside_mm, angle_deg, speed_mm_per_s, wanted_mm_per_s, say}.
 export const guidanceOf = (id, order) => answer(sessionPath(id, `pass-orders/${order}/guidance`));

@@ -2,18 +2,17 @@
 
 import { byId } from "./element.js";
 import { moment } from "./numbers.js";
-import { drawSessions, sessionDetail } from "./panels.js";
+import { drawSessions, sessionDetail, UNDER_WAY } from "./panels.js";
 import { deleteSession, listSessions } from "./service.js";
-import { OVER } from "./session_view.js";
 
 const RETRY_MS = 1000;
 
 const newestFirst = (sessions) => [...sessions].sort((a, b) => new Date(b.created ?? 0) - new Date(a.created ?? 0));
 
-// The newest session that is still live, else the newest of all, else null.
+// The newest session that scans, else the newest that has scanned anything, else the newest of all, else null.
 export function firstChoice(sessions) {
   const sorted = newestFirst(sessions);
-  return sorted.find((session) => !OVER.has(session.state)) ?? sorted[0] ?? null;
+  return sorted.find(({ state }) => UNDER_WAY.has(state)) ?? sorted.find(({ lines }) => lines > 0) ?? sorted[0] ?? null;
 }
 
 export class SessionPicker {
@@ -39,7 +38,7 @@ export class SessionPicker {
     this.#load(null);
   }
 
-  // Choose at once: the session named in the address, else the newest live one; waits for one to appear.
+  // Choose at once: the session named in the address, else the one that is likely wanted; waits for one to appear.
   async begin(named) {
     try {
       const { sessions } = await listSessions();

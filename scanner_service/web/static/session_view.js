@@ -27,13 +27,18 @@ export class SessionView {
   }
 
   open(id) {
-    this.#connection?.close();
     this.id = id;
     this.status = this.regions = this.box = null;
     this.#surveyed = null;
     this.sample = new Float32Array(0);
     this.store.clear();
-    this.#connection = new LiveConnection(liveAddress(id), {
+    this.renew();
+  }
+
+  // Ask for everything again, such as when points flow again or were withdrawn; what is in sight stays until it is there.
+  renew() {
+    this.#connection?.close();
+    this.#connection = new LiveConnection(liveAddress(this.id), {
       onBinary: (buffer) => this.#takeBinary(buffer),
       onText: (text) => this.#takeText(text),
       onState: (state) => {

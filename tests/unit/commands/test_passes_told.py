@@ -25,6 +25,13 @@ def test_an_order_says_what_came_of_what_was_foretold(changed, told):
     assert fate_of(ORDER | {"outcome": OUTCOME | changed}) == told
 
 
+@pytest.mark.parametrize("status", ["doubted", "withdrawn"])
+def test_an_order_whose_points_do_not_count_has_reached_nothing(status):
+    told = fate_of(ORDER | {"status": status, "order": 7, "outcome": OUTCOME | {"doubt": "was the part moved?"}})
+    assert told.startswith(status) and "reached" not in told and "found" not in told
+    assert ("was the part moved? If so, `scanner rescan SESSION --withdraw 7`" in told) == (status == "doubted")
+
+
 @pytest.mark.parametrize(
     ("promised_mm2", "explores_mm2", "told"),
     [

@@ -10,7 +10,8 @@ from scanner_service.cli import app
     ("options", "says"),
     [
         (["--coverage", "0.5"], "say --auto as well"),
-        (["--auto", "--cancel", "1"], "say one of --pass, --auto and --cancel"),
+        (["--auto", "--cancel", "1"], "say one of --pass, --auto, --cancel"),
+        (["--withdraw", "1", "--keep", "1"], "--withdraw and --keep"),
         (["--pass", "1"], "say --pass and --plan together"),
     ],
 )

@@ -64,6 +64,27 @@ def test_a_pass_over_a_region_makes_it_rescanned_when_it_fails_still_and_resolve
     assert json.dumps([change.to_dict() for change in changes], allow_nan=False)
 
 
+def test_a_region_goes_with_the_pass_that_found_it_and_is_open_again_without_the_one_that_was_over_it() -> None:
+    """A cliff, and a pass that believes itself 40 mm aside: what it shows there is not there."""
+    cliff, elsewhere = triangulated(_raised_cliff, X, Y, 0.3), triangulated(_raised_cliff, X, Y, 0.3, pass_number=2)
+    for name in ("points", "laser"):
+        setattr(elsewhere, name, [values + np.array([40.0, 0.0, 0.0]) for values in getattr(elsewhere, name)])
+    floor = straight_down(_raised_cliff, X, np.arange(3.6, 6.9, 0.3), 0.3, pass_number=3)
+    others = straight_down(_raised_cliff, X + 40.0, Y[:20], 0.3)  # points there of the pass that stays, without a jump
+    book = RegionBook()
+    _followed(book, cliff.joined(elsewhere), 1)
+    true, false = sorted(book.current, key=lambda region: float(region.centroid_mm[0]))
+    assert true.reason is false.reason is Reason.SHADOW
+    _followed(book, cliff.joined(elsewhere).joined(floor), 2)
+    assert {region.region_id: region.status for region in book.current}[true.region_id] is RegionStatus.RESCANNED
+    book = RegionBook.from_dict(json.loads(json.dumps(book.to_dict())))
+    _followed(book, cliff.joined(others), 3)
+    (left,), (gone,) = book.current, book.resolved
+    assert (left.region_id, left.status) == (true.region_id, RegionStatus.OPEN)
+    assert (gone.region_id, gone.history[-1].why) == (false.region_id, "the pass that found it was withdrawn")
+    assert left.history[-1].why == "the pass that was over it was withdrawn"
+
+
 def test_a_region_whose_points_wait_is_not_called_resolved() -> None:
     book, scan = RegionBook(), straight_down(_ramps, X, Y, 0.3)
     _followed(book, scan, 1)

@@ -11,7 +11,7 @@ from scanner_service.rescan.requirement import Requirement, RequirementUnusable
 from scanner_service.sessions.book import SessionBook
 from scanner_service.sessions.errors import KernelsCompiling, SessionBusy, SourceUnusable
 from scanner_service.sessions.ledger import Ledger
-from scanner_service.sessions.readiness import preparing, refuse_until_ready, warm_up
+from scanner_service.sessions.readiness import Preparing, preparing, refuse_until_ready, warm_up
 from scanner_service.sessions.replay_source import ReplaySource
 from scanner_service.sessions.settings import SessionSettings
 from scanner_service.sessions.source_specs import DeviceSpec, PushSpec, RecordSpec
@@ -232,6 +232,10 @@ def test_a_session_is_refused_before_anything_is_opened_while_it_is_too_early(tm
     early.close()
     warm_up()
     assert preparing() is None
+    assert [str(Preparing("the map", 2, 4, 3.2, compiles)).split()[0] for compiles in (False, True)] == [
+        "loading",
+        "compiling",
+    ]
     refuse_until_ready()  # nobody is refused once all is compiled
 
 

@@ -113,6 +113,7 @@ test("while a scan is under way coverage and regions are said to be of what was 
   assert.equal(coverageName({ state: "stopped", coverage_kind: "observed" }), "Observed coverage");
   assert.equal(coverageName({ state: "scanning", coverage_kind: "reference" }), "Coverage of the nominal part");
   assert.equal(noRegions({ state: "scanning" }), "No region of the surface seen so far needs another scan.");
-  assert.equal(noRegions({ state: "stopped" }), "No region needs another scan.");
+  assert.equal(noRegions({ state: "stopped", coverage: 0.9 }), "No region needs another scan.");
+  assert.equal(noRegions({ state: "stopped", coverage: null }), "Nothing was judged.");
   assert.equal(coverageName(null), "Observed coverage");
 });

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 const { inWords, presetOf, reached, refusalsByField, requestOf, textsOf } = await import("../../../scanner_service/web/static/requirement_form.js");
-const { fate, foretold, loopSaid, planning, served } = await import("../../../scanner_service/web/static/passes_panel.js");
+const { fate, foretold, loopSaid, outOfReach, planning, served } = await import("../../../scanner_service/web/static/passes_panel.js");
 const { opening } = await import("../../../scanner_service/web/static/numbers.js");
 
 const STANDARD = { preset: "standard", density_per_mm2: null, density_share: 0.5, line_spacing_mm: null, chord_error_mm: null, finest_line_spacing_mm: 0.05, incidence_deg: null, noise_mm: null, coverage_share: 0.95, interest: null };
@@ -75,6 +75,13 @@ test("a pass names its regions as the list does, an order what became of it", ()
   assert.equal(fate({ status: "done", message: null, outcome, reached_end: true }), "promised 12 (8 to 15), reached 9 mm²; explored: 55 found, 30 (0 to 81) mm² expected");
   assert.equal(fate({ status: "done", message: null, outcome: { ...outcome, promised_mm2: 0 }, reached_end: true }), "explored: 55 found, 30 (0 to 81) mm² expected");
   assert.equal(fate({ status: "failed", message: "the port is gone", outcome: null, reached_end: false }), "the port is gone");
+  for (const status of ["doubted", "withdrawn"]) assert.doesNotMatch(fate({ status, message: null, outcome, reached_end: true }), /reached|found/);
+});
+
+test("what no pass brings is told as a part of its region, and why", () => {
+  const lost = { region: 3, area_mm2: 54.6, share: 0.25, why: "the rig cannot face it" };
+  assert.equal(outOfReach(lost), "Unreachable: 55 mm² of region 3 (25.0\u202f% of what is wanted there): the rig cannot face it");
+  assert.match(outOfReach({ ...lost, region: null }), /outside of any region, as guessed/);
 });
 
 test("while a plan is made that is said, with the seconds once there are some", () => {

@@ -111,6 +111,9 @@ def test_no_place_is_promised_twice_and_none_for_others_by_whichever_places_pass
 def test_what_a_fixed_axis_cannot_see_is_unreachable_and_turning_the_part_helps():
     judged = Bench(SMALL_STEP).scan(FROM_ABOVE, *ALONG_SMALL_STEP, 0.25).judged()
     fixed = plan_passes(*judged, linear_reach(), OPTICS, WISHES)
+    (shadow,) = judged[1].regions
+    lost = [one for one in fixed.unreachable if one.region == shadow.number]
+    assert lost and all(one.area_mm2 == pytest.approx(one.share * shadow.area_mm2) for one in lost)
     turned = plan_passes(*judged, linear_reach(part_may_turn=True), OPTICS, WISHES)
     assert sum(one.area_mm2 for one in fixed.unreachable) > sum(one.area_mm2 for one in turned.unreachable)
     assert all(one.why for one in fixed.unreachable)
@@ -129,6 +132,11 @@ def test_what_was_promised_in_vain_is_given_up_so_that_a_loop_ends():
         if not plan.passes:
             break
         tried = tried.and_also(plan.passes[0].places_mm)
+    shares = {one.region: 0.0 for one in plan.unreachable}
+    for one in plan.unreachable:
+        shares[one.region] += one.share
+    assert "brought no returns" in "".join(one.why for one in plan.unreachable)
+    assert len(shares) < len(plan.unreachable) and max(shares.values()) <= 1.0 + 1e-9  # of several reasons together
     assert promised[-1] < promised[0]
 
 
