@@ -35,9 +35,9 @@ def find_steps(columns, rows, groups, normals, borders, starts, ends, ways, plan
 
     `rows` (n,), `groups` (n,) and `normals` (n, 3) are the points' rows, passes and normals, `borders` whether a row of
     the map may be where surface ends, `planes` (k, 3) the normals of the cuts, `own` (k,) the gaps' passes, `reaches`
-    (k,) their radii. Written are `found` (k, STEPS, 2), the rows at both ends of each step, -1 where
-    there are fewer, and `alone` (k,), True where no other pass has a point in the cut. On entry `found` holds the rows
-    of the start and the end; where a gap is alone it still does.
+    (k,) their radii. Written are `found` (k, STEPS, 2), the rows at both ends of each step, -1 where there are fewer,
+    and `alone` (k,), True where no other pass has a point in the cut that shows anything new. On entry `found` holds
+    the rows of the start and the end; where a gap is alone it still does.
     """
     taken, latest = np.full((_SIDE, _SIDE), -1, dtype=np.int64), np.full((_SIDE, _SIDE), -1, dtype=np.int64)
     own_points = (np.empty((len(rows), 6)), latest, np.empty(len(rows), dtype=np.int64))
@@ -56,31 +56,37 @@ def find_steps(columns, rows, groups, normals, borders, starts, ends, ways, plan
                 break
             fine *= 1.5
         _clear(own_points, many, cut)
-        alone[k] = others == 0
-        if others == 0:
+        alone[k] = count == 0
+        if alone[k]:
             continue
         first, last = found[k, 0]
         place[count, 0], place[count, 1], row[count] = length, 0.0, last
         place[count, 2:] = 0.0
-        before, width = _chain(place, count, reaches[k])
+        before, width = _chain(place, row, count, reaches[k])
         enough = max(min(_TOUCHING * reaches[k], _SHARE * length), fine / _THIN)  # thinned points are further apart
-        found[k] = -1
-        for n in range(STEPS):
-            widest, here = -1, count
-            while here >= 0:
-                one = row[before[here]] if before[here] >= 0 else first
-                if (
-                    width[here] > enough
-                    and (borders[one] or borders[row[here]])
-                    and (widest < 0 or width[here] > width[widest])
-                ):
-                    widest = here
-                here = before[here]
-            if widest < 0:
-                break
-            found[k, n, 0] = row[before[widest]] if before[widest] >= 0 else first
-            found[k, n, 1] = row[widest]
-            width[widest] = 0.0
+        _widest(before, width, row, count, borders, first, enough, found[k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _widest(before, width, row, last, borders, first, enough, found):
+    """Write the rows at both ends of the widest steps of a chain that are wider than `enough` and have a border."""
+    found[:] = -1
+    for n in range(STEPS):
+        widest, here = -1, last
+        while here >= 0:
+            one = row[before[here]] if before[here] >= 0 else first
+            if (
+                width[here] > enough
+                and (borders[one] or borders[row[here]])
+                and (widest < 0 or width[here] > width[widest])
+            ):
+                widest = here
+            here = before[here]
+        if widest < 0:
+            break
+        found[n, 0] = row[before[widest]] if before[widest] >= 0 else first
+        found[n, 1] = row[widest]
+        width[widest] = 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -218,23 +224,25 @@ def _lay_down(place, normal, cut):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _chain(place, last, reach):
+def _chain(place, row, last, reach):
     """Prim's tree over places (n, 4) from the start of a gap until it reaches the place `last`.
 
-    Of all ways there it has the one whose widest step is the least. For each place the one before it (-1: the start),
-    and the width of the step between; the first and the last are shorter by the radius, since what the gap's own pass
-    saw around both ends is left out. A surface has a free side: no step wider than touching neighbourhoods goes
-    backward along the surface at its ends, through the body to its other side.
+    Of all ways there it has the one whose widest step is the least; of equal ones that to or from the lower row. For
+    each place the one before it (-1: the start), and the width of the step between; the first and the last are shorter
+    by the radius, since what the gap's own pass saw around both ends is left out. A surface has a free side: no step
+    wider than touching neighbourhoods goes backward along the surface at its ends, through the body to its other side.
     """
-    width, before = (
-        np.maximum(np.sqrt(place[: last + 1, 0] ** 2 + place[: last + 1, 1] ** 2) - reach, 0.0),
-        np.full(last + 1, -1, dtype=np.int64),
-    )
+    width, before = np.empty(last + 1), np.full(last + 1, -1, dtype=np.int64)
+    for n in range(last + 1):
+        away = math.sqrt(place[n, 0] ** 2 + place[n, 1] ** 2)
+        width[n] = max(away - reach, 0.0)
+        if away > _TOUCHING * reach and _goes_back(place[n], place[n, 0], place[n, 1], away):
+            width[n] = math.inf
     done = np.zeros(last + 1, dtype=np.bool_)
     while True:
         at = -1
         for n in range(last + 1):
-            if not done[n] and (at < 0 or width[n] < width[at]):
+            if not done[n] and (at < 0 or width[n] < width[at] or (width[n] == width[at] and row[n] < row[at])):
                 at = n
         done[at] = True
         if at == last:
@@ -243,14 +251,18 @@ def _chain(place, last, reach):
             if not done[n]:
                 u, v = place[n, 0] - place[at, 0], place[n, 1] - place[at, 1]
                 away = math.sqrt(u * u + v * v)
-                if away > _TOUCHING * reach:
-                    back = -_BACKWARD * away
-                    if place[at, 2] * u + place[at, 3] * v < back or place[n, 2] * u + place[n, 3] * v < back:
-                        continue
+                if away > _TOUCHING * reach and (_goes_back(place[at], u, v, away) or _goes_back(place[n], u, v, away)):
+                    continue
                 if n == last:
                     away = max(away - reach, 0.0)
-                if away < width[n]:
+                if away < width[n] or (away == width[n] and before[n] >= 0 and row[at] < row[before[n]]):
                     width[n], before[n] = away, at
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _goes_back(place, u, v, away):
+    """Whether a step (u, v) goes backward along the surface at a place."""
+    return place[2] * u + place[3] * v < -_BACKWARD * away
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -273,32 +285,42 @@ def find_crossed(columns, lines, lasers, firsts, lasts, planes, reaches, middles
             high[axis] = min(middle + _NEAR * step, middles[k, axis] + halves[k])
         i0, j0 = max(0, math.floor((low[0] - lowest[0]) / side)), max(0, math.floor((low[1] - lowest[1]) / side))
         i1, j1 = math.floor((high[0] - lowest[0]) / side), math.floor((high[1] - lowest[1]) / side)
+        j1 = min(j1, many_y - 1)
         count[:] = 0
         for i in range(i0, min(i1, many_x - 1) + 1):
-            if count.min() >= _RAYS:
-                break
-            for j in range(j0, min(j1, many_y - 1) + 1):
-                for n in range(begin[i * many_y + j], begin[i * many_y + j + 1]):
-                    x, y, z = places[n, 0], places[n, 1], places[n, 2]
-                    if not (low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]):
-                        continue
-                    a, b, c = x - firsts[k, 0], y - firsts[k, 1], z - firsts[k, 2]
-                    behind = a * across[0] + b * across[1] + c * across[2]
-                    if abs(behind) < _BEHIND * step:
-                        continue
-                    line = lines[n]
-                    p, q, r = lasers[line, 0] - x, lasers[line, 1] - y, lasers[line, 2] - z
-                    towards = p * across[0] + q * across[1] + r * across[2]
-                    if behind * towards >= 0 or abs(towards) < abs(behind):
-                        continue
-                    share = -behind / towards
-                    a, b, c = a + share * p, b + share * q, c + share * r
-                    if abs(a * planes[k, 0] + b * planes[k, 1] + c * planes[k, 2]) > reaches[k]:
-                        continue
-                    third = math.floor(3.0 * (a * way[0] + b * way[1] + c * way[2]) / (step * step))
-                    if 0 <= third < 3:
-                        count[third] += 1
+            if j0 <= j1 and count.min() < _RAYS:
+                from_, to = begin[i * many_y + j0], begin[i * many_y + j1 + 1]  # columns along y stand together
+                _count_through(
+                    places[from_:to], lines[from_:to], lasers, low, high, firsts[k], way, across, planes[k],
+                    reaches[k], count,
+                )  # fmt: skip
         crossed[k] = count.min() >= _RAYS
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_through(places, lines, lasers, low, high, first, way, across, plane, reach, count):
+    """Count the rays to places between `low` and `high` that go through each third of a step."""
+    square = way[0] ** 2 + way[1] ** 2 + way[2] ** 2
+    for n in range(len(places)):
+        x, y, z = places[n, 0], places[n, 1], places[n, 2]
+        if not (low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]):
+            continue
+        a, b, c = x - first[0], y - first[1], z - first[2]
+        behind = a * across[0] + b * across[1] + c * across[2]
+        if behind * behind < _BEHIND * _BEHIND * square:
+            continue
+        line = lines[n]
+        p, q, r = lasers[line, 0] - x, lasers[line, 1] - y, lasers[line, 2] - z
+        towards = p * across[0] + q * across[1] + r * across[2]
+        if behind * towards >= 0 or abs(towards) < abs(behind):
+            continue
+        share = -behind / towards
+        a, b, c = a + share * p, b + share * q, c + share * r
+        if abs(a * plane[0] + b * plane[1] + c * plane[2]) > reach:
+            continue
+        third = math.floor(3.0 * (a * way[0] + b * way[1] + c * way[2]) / square)
+        if 0 <= third < 3:
+            count[third] += 1
 
 
 def compile_cuts() -> None:

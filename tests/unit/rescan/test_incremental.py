@@ -47,6 +47,7 @@ def passes(draw: st.DrawFn) -> list[StoredLine]:
     for number in range(draw(st.integers(1, 1 if is_long else 3))):
         turned, backward = draw(st.booleans()), draw(st.booleans())
         lean_mm = draw(st.sampled_from([0.0, -70.0, 70.0]))  # what one pass hides another may see
+        turn_deg = draw(st.sampled_from([0.0, 1.0]))  # a line: the scanner goes round the part
         spacing = draw(st.sampled_from([0.3, 0.45]))
         stations = np.arange(0.5, 7.5, spacing) if not is_long else 0.5 + spacing * np.arange(96)
         if draw(st.booleans()):
@@ -59,7 +60,8 @@ def passes(draw: st.DrawFn) -> list[StoredLine]:
         if draw(st.booleans()):
             late = order.pop(3)
             order.insert(8, late)
-        lines += [_line(surface, number, at, stations[at], spacing, turned, rng, lean_mm) for at in order]
+        lean_rad = np.radians(turn_deg * (np.arange(len(stations)) - len(stations) // 2))
+        lines += [_line(surface, number, at, stations[at], spacing, turned, rng, lean_mm, lean_rad[at]) for at in order]
     return lines
 
 
@@ -72,6 +74,7 @@ def _line(
     turned: bool,
     rng: np.random.Generator,
     lean_mm: float = 0.0,
+    lean_rad: float = 0.0,
 ) -> StoredLine:
     along = np.arange(-4.0, 4.0, 0.25)
     across = np.full_like(along, station)
@@ -79,6 +82,7 @@ def _line(
     z = surface(x, np.mod(y, 8.0)) + 0.005 * rng.standard_normal(len(x))
     seen = np.isfinite(z) & (rng.random(len(x)) > 0.03) & (rng.random() > 0.05)
     travel = np.array([1.0, 0.0, 0.0]) if turned else np.array([0.0, 1.0, 0.0])
+    up, back_mm = np.array([0.0, 0.0, 1.0]), 100.0 * np.tan(lean_rad)  # the plane leans, and the laser with it
     line = Scanline(
         device_id="A",
         boot_id=1,
@@ -87,8 +91,9 @@ def _line(
         device_time_s=0.0,
         points_mm=np.column_stack([x, y, z]),
         missing=~seen,
-        laser_mm=np.array([station - 4.0, 4.0 + lean_mm, 100.0] if turned else [lean_mm, station, 100.0]),
-        plane_normal=travel,
+        laser_mm=np.array([station - 4.0, 4.0 + lean_mm, 100.0] if turned else [lean_mm, station, 100.0])
+        - back_mm * travel,
+        plane_normal=np.cos(lean_rad) * travel + np.sin(lean_rad) * up,
         travel=travel,
         position_mm=station,
         line_spacing_mm=spacing,
