@@ -17,7 +17,8 @@ from benchmarks.machine import Neighbours, fetch_memory, resident_bytes, use_cor
 from benchmarks.reader import Reader
 from scanner_service.analysis.compiling import compile_kernels
 from scanner_service.analysis.intake import StoredLine
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.analysis.radius import LiveRule, RadiusSettings
 
 READS_PER_S = 30.0

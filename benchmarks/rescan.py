@@ -29,7 +29,8 @@ from benchmarks.rescan_truth import (
 )
 from drivers.scanline import Pose, Scanline
 from scanner_service.analysis.intake import quantise
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.regions import RegionReport, find_regions

@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 
 from drivers.scanline import Float64Array, Pose, SensorGeometry
 from scanner_service.analysis.intake import quantise
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.rescan.coverage import observed_coverage
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.passes.gain import prospect_of

@@ -7,7 +7,8 @@ import numpy as np
 from benchmarks.rescan_scan import DENSITY_PER_MM2, reach_of, straight
 from drivers.scanline import Pose
 from scanner_service.analysis.intake import quantise
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.rescan.passes.looks import look_of
 from scanner_service.rescan.passes.optics import ScannerOptics
 from scanner_service.rescan.passes.planner import Wishes, plan_passes

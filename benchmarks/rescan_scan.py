@@ -13,7 +13,8 @@ from benchmarks.scannable import Allowed, CoverageTruth, sample_surface, scannab
 from drivers.rig_limits import AxisKind, RigLimits
 from drivers.scanline import Float64Array, Pose, Scanline
 from scanner_service.analysis.intake import quantise
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.reach import Reach
 from simulators.meshes import load_mesh

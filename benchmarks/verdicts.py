@@ -16,7 +16,8 @@ from typing import TypeVar
 import numpy as np
 
 from benchmarks.cloud import NOISE_MM, make_lines
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.rescan.coverage import CoverageBook
 from scanner_service.rescan.regions import RegionFinder
 from scanner_service.rescan.requirement import Requirement

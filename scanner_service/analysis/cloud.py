@@ -8,7 +8,8 @@ import numpy as np
 
 from drivers.scanline import Float64Array, Scanline
 from scanner_service.analysis.intake import QUANTUM_MM, quantise
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.analysis.radius import (
     FLEXIBLE_POINTS,
     GLOBAL_SHARE,

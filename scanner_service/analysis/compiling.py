@@ -6,7 +6,8 @@ import numpy as np
 
 from drivers.scanline import Scanline
 from scanner_service.analysis.intake import StoredLine, quantise
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.analysis.radius import LiveRule, RadiusSettings
 from scanner_service.analysis.snapshot import MapSnapshot
 

@@ -17,7 +17,8 @@ from typing import TypeVar
 from drivers.scanline import Float64Array, Scanline
 from scanner_service.analysis.errors import MapFull, TooManyPasses
 from scanner_service.analysis.intake import StoredLine, quantise
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.analysis.passes import PassKey, pass_key
 from scanner_service.sessions.errors import LineRefused, SessionNotLive
 from scanner_service.sessions.ledger import Ledger

@@ -9,7 +9,7 @@ from typing import Any
 
 from drivers.tally import PassTally
 from scanner_service.analysis.intake import StoredLine
-from scanner_service.analysis.live_map import Accepted
+from scanner_service.analysis.map_settings import Accepted
 from scanner_service.analysis.passes import PassKey
 from scanner_service.sessions.pass_accounts import (
     SERVICE_ENDED,

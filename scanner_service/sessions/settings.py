@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from scanner_service.analysis.live_map import MapSettings
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.analysis.radius import LiveRule, RadiusSettings
 from scanner_service.rescan.requirement import Requirement
 from scanner_service.storage.formats.reference_mesh import ReferenceSpec

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from scanner_service.analysis.ahead import Ahead
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 
 ROWS = 1 << 20
 

@@ -4,7 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.analysis.passes import pass_key
 from scanner_service.analysis.radius import RadiusSettings
 from scanner_service.analysis.snapshot import Unreliable

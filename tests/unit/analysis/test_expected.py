@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from scanner_service.analysis.expected import expected_density_per_mm2, expected_neighbours, surface_spacing_mm
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from tests.unit.analysis.scans import surface_scan
 
 

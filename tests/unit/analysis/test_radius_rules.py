@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from scanner_service.analysis.global_radius import FIRST_ESTIMATE
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.analysis.radius import RadiusSettings, sample_rows
 from scanner_service.analysis.snapshot import RadiusRule
 from tests.oracle import Q_MM, Oracle

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.api.live_frames import FLAG_FULL, HEADER, MAGIC, point_message
 from scanner_service.sessions.results import Verdict
 from scanner_service.sessions.updates import VerdictBook, changes_since, read_page

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from drivers.scanline import Scanline, SensorGeometry
 from scanner_service.analysis.intake import StoredLine, quantise
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.rescan.coverage import CoverageBook, observed_coverage
 from scanner_service.rescan.judgement import Reason
 from scanner_service.rescan.regions import RegionFinder, find_regions

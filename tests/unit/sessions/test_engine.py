@@ -6,7 +6,7 @@ from concurrent.futures import Future, wait
 import numpy as np
 import pytest
 
-from scanner_service.analysis.live_map import MapSettings
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.sessions.engine import INBOX_LINES, Engine
 from scanner_service.sessions.errors import SessionNotLive
 from scanner_service.storage.record import Record

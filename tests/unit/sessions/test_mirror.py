@@ -6,7 +6,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.analysis.snapshot import LineTable, MapSnapshot
 from scanner_service.rescan.regions import find_regions
 from scanner_service.sessions import mirror as module

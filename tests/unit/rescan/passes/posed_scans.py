@@ -7,7 +7,8 @@ import numpy as np
 from drivers.rig_limits import AxisKind, RigLimits
 from drivers.scanline import Pose
 from scanner_service.analysis.intake import quantise
-from scanner_service.analysis.live_map import LiveMap, MapSettings
+from scanner_service.analysis.live_map import LiveMap
+from scanner_service.analysis.map_settings import MapSettings
 from scanner_service.rescan.passes.motion import StraightMotion
 from scanner_service.rescan.passes.optics import ScannerOptics
 from scanner_service.rescan.passes.reach import Reach
