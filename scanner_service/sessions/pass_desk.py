@@ -31,7 +31,7 @@ from scanner_service.sessions.pass_orders import (
 )
 from scanner_service.sessions.pass_planning import wanted_of
 from scanner_service.sessions.plan_in_force import PlanInForce
-from scanner_service.sessions.reckoning import brought_by
+from scanner_service.sessions.reckoning import Brought, brought_by
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.rig_setups import RigSetup, is_driven, start_pass
 from scanner_service.sessions.session import LiveSession
@@ -134,9 +134,8 @@ class PassDesk:
         with self._lock:
             order = self._orders.get(order_id)
             order.keep()
-            self._learn(order)
-            self._decided()
-        self._session.event(KEPT, {"order": order_id})
+            self._decided()  # where the sensor stands is not asked: other passes may have moved it since
+            self._session.event(KEPT, {"order": order_id})
         return order
 
     def carry_out(self, order_id: int, part_is_turned: bool = False) -> PassOrder:
@@ -302,7 +301,7 @@ class PassDesk:
                     return
                 order.status, order.message = PassStatus.FAILED, str(error)
                 self._learn(order)
-            self._session.event(OUTCOME, outcome_event(order))
+                self._session.event(OUTCOME, outcome_event(order))
         finally:
             self._task(-1)
             order.done.set()
@@ -333,23 +332,25 @@ class PassDesk:
 
     def _follow(self, order: PassOrder, before: Results, setup: RigSetup) -> None:
         """The thread of one pass: wait for its end, then say what it brought."""
+        brought: Brought | None = None
         try:
             self._session.wait_until_over()
             after = self._session.fresh_results()
             brought = brought_by(order.planned, before, after, setup, self._session.engine)
             has_failed = self._session.state == "failed"
             failure = (self._session.status().message or "the scan failed") if has_failed else None
-            with self._lock:
-                order.end(brought, failure)
-                self._learn(order)
-                self._session.doubted = self._orders.doubt()
         except Exception as error:  # noqa: BLE001 - the thread's end: whoever waits for the order must be told
             _LOG.exception("pass order %d of session %s", order.order_id, self._session.row.session_id)
-            with self._lock:
-                order.message, order.status = str(error), PassStatus.FAILED
-                self._learn(order)
+            failure = str(error)
         try:
-            self._session.event(OUTCOME, outcome_event(order))
+            with self._lock:  # the record has what becomes of an order as it comes
+                if brought is None:
+                    order.message, order.status = failure, PassStatus.FAILED
+                else:
+                    self._orders.ended(order, brought, failure)
+                self._learn(order)
+                self._decided()
+                self._session.event(OUTCOME, outcome_event(order))
         finally:
             self._task(-1)
             order.done.set()

@@ -94,6 +94,13 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned, monke
         learn(order)
 
     monkeypatch.setattr(desk, "_learn", planned_before)
+    event, held = session.event, {}
+
+    def owned(kind, details):
+        held[kind] = desk._lock._is_owned()
+        event(kind, details)
+
+    monkeypatch.setattr(session, "event", owned)
     order = desk.accept(plan.passes[0].number)
     assert order.status is PassStatus.ACCEPTED
     desk.carry_out(order.order_id)
@@ -105,6 +112,7 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned, monke
     session.stop()
     desk.wait_for(order)
     assert order.status is PassStatus.DONE
+    assert held["pass_outcome"]  # no decision comes between what is and what the record tells
     assert order.reached_end and order.teaches
     assert order.outcome.promised_mm2 == pytest.approx(one.promised.mm2)
     assert order.outcome.expected_mm2 == pytest.approx(one.explores.mm2)
