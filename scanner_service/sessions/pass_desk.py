@@ -49,6 +49,7 @@ class PassDesk:
         self._lock = threading.RLock()  # held for moments only: whoever asks is answered at once
         self._plans = PlanInForce(session, rigs, self._lock, lambda: (self._orders.all(), self._standing))
         self._setting_off: int | None = None  # the order whose pass is just being started: one at a time
+        self._withdrawing = 0  # how many withdrawals are under way: no pass is set off meanwhile
         self._tasks = 0  # passes and loops under way
         self._orders = OrderBook()
         self._standing: Pose | None = None
@@ -114,20 +115,16 @@ class PassDesk:
     def withdraw(self, order_id: int) -> PassOrder:
         """Take what a pass has scanned out of the map, not of the record; raises PassUnknown, SessionBusy."""
         with self._lock:
-            keys, other = self._orders.to_withdraw(order_id), self._under_way()
-            if other is not None:  # what it brings is told by the surface that was known before it
-                raise SessionBusy(f"pass order {other} is being carried out: withdraw another one when that is over")
-        for key in keys:
-            self.withdraw_pass(key)
+            keys = self._orders.to_withdraw(order_id)
+        self._take_out(keys)
         return self.order(order_id)
 
     def withdraw_pass(self, key: PassKey) -> int:
-        """Take any pass of the session out of the map; returns how many points that were, 0 when it is not there."""
-        points = self._session.withdraw_pass(key)
-        with self._lock:
-            self._orders.withdrawn(key)
-            self._decided()
-        return points
+        """Take any pass of the session out of the map; returns how many points that were, 0 when it is not there.
+
+        Raises SessionBusy.
+        """
+        return self._take_out([key])
 
     def keep(self, order_id: int) -> PassOrder:
         """Count what a doubted pass has brought after all; raises PassUnknown, SessionBusy."""
@@ -242,6 +239,25 @@ class PassDesk:
 
     # -- inside -------------------------------------------------------------------------------------------------
 
+    def _take_out(self, keys: list[PassKey]) -> int:
+        """Withdraw passes, while none is set off: what one brings is told by the surface that was known before it."""
+        with self._lock:
+            other = self._under_way()
+            if other is not None:
+                raise SessionBusy(f"pass order {other} is being carried out: withdraw a pass when that is over")
+            self._withdrawing += 1
+        try:
+            points = 0
+            for key in keys:
+                points += self._session.withdraw_pass(key)
+                with self._lock:
+                    self._orders.withdrawn(key)
+                    self._decided()
+            return points
+        finally:
+            with self._lock:
+                self._withdrawing -= 1
+
     def _task(self, more: int) -> None:
         """One pass or loop more, or less, is under way."""
         with self._lock:
@@ -268,6 +284,8 @@ class PassDesk:
                 raise PartNotTurned(
                     f'first {turn}; then carry pass order {order_id} out with {{"part_is_turned": true}}: it waits on'
                 )
+            if self._withdrawing:
+                raise SessionBusy(f"a pass is being withdrawn: carry pass order {order_id} out when that is over")
             other = self._under_way()
             if other is not None:
                 why = (

@@ -49,9 +49,8 @@ class PassOrder:
     """A pass that was accepted: which one, how far it has come, and what became of it.
 
     `map_passes` are the numbers that its scanlines have in the map, once it is done, and `passes` the names of these
-    passes; `reached_end` is True when they go
-    through to the end of the pass, None when the record is of a time when this was not kept. `done` is set when a pass
-    that was carried out is over and its outcome told.
+    passes; `reached_end` is True when they go through to the end of the pass, None when the record is of a time when
+    this was not kept. `done` is set when a pass that was carried out is over and its outcome told.
     """
 
     order_id: int

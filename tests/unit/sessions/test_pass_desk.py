@@ -409,9 +409,22 @@ def test_one_pass_is_carried_out_at_a_time(book, scanned):
         desk.carry_out(second.order_id)
     assert (first.status, second.status, session.state) == (PassStatus.RUNNING, PassStatus.CANCELLED, "stopped")
     assert not first.done.is_set()
+    with pytest.raises(SessionBusy, match="pass order 1 is being carried out: withdraw"):
+        desk.withdraw_pass(("any", 1, 0))
     may_judge.set()
     desk.wait_for(first)
     assert first.done.is_set() and first.status is PassStatus.DONE
+    third, take_out, refused = desk.accept(1), session.withdraw_pass, []
+
+    def meanwhile(key):
+        with pytest.raises(SessionBusy, match="a pass is being withdrawn") as caught:
+            desk.carry_out(third.order_id)
+        refused.append(caught.value)
+        return take_out(key)
+
+    session.withdraw_pass = meanwhile
+    desk.withdraw(first.order_id)
+    assert refused and third.status is PassStatus.ACCEPTED
     desk.carry_out(desk.accept(1).order_id)
     session.stop()
 
