@@ -50,7 +50,8 @@ def _of_density(requirement: Requirement, snapshot: MapSnapshot) -> str | None:
         return None
     return (
         f"a density of {_told(requirement.density_per_mm2)} points/mm² is more than a pass of this scanner gives: "
-        f"points {point_mm:.2g} mm apart on lines {line_mm:g} mm apart are {_told(most_per_mm2)} points/mm²; ask for less"
+        f"points {point_mm:.2g} mm apart on lines {line_mm:g} mm apart are {_told(most_per_mm2)} points/mm²; ask for "
+        "less"
     )
 
 
