@@ -5,6 +5,7 @@ Refuses nothing: what contradicts itself is refused where it is asked for (`requ
 
 import numpy as np
 
+from drivers.scanline import BoolArray
 from scanner_service.analysis.snapshot import MapSnapshot
 from scanner_service.rescan.requirement import Requirement
 
@@ -21,7 +22,7 @@ def remarks_on(requirement: Requirement, snapshot: MapSnapshot) -> tuple[str, ..
     return tuple(sentence for sentence in said if sentence is not None)
 
 
-def _of_interest(requirement: Requirement, snapshot: MapSnapshot, counted: np.ndarray) -> str | None:
+def _of_interest(requirement: Requirement, snapshot: MapSnapshot, counted: BoolArray) -> str | None:
     """A region of interest in which nothing was scanned, once a pass is over: until then the scan may come to it."""
     if requirement.interest is None or not snapshot.settled[counted].all():
         return None
@@ -48,6 +49,12 @@ def _of_density(requirement: Requirement, snapshot: MapSnapshot) -> str | None:
     if requirement.density_per_mm2 <= most_per_mm2:
         return None
     return (
-        f"a density of {requirement.density_per_mm2:,.0f} points/mm² is more than a pass of this scanner gives: points "
-        f"{point_mm:.2g} mm apart on lines {line_mm:g} mm apart are {most_per_mm2:,.0f} points/mm²; ask for less"
+        f"a density of {_told(requirement.density_per_mm2)} points/mm² is more than a pass of this scanner gives: "
+        f"points {point_mm:.2g} mm apart on lines {line_mm:g} mm apart are {_told(most_per_mm2)} points/mm²; ask for "
+        "less"
     )
+
+
+def _told(density_per_mm2: float) -> str:
+    """To three digits where it is small: what is less than one is not nothing."""
+    return f"{density_per_mm2:,.0f}" if density_per_mm2 >= 100.0 else f"{density_per_mm2:.3g}"

@@ -31,7 +31,7 @@ from scanner_service.sessions.pass_orders import (
 )
 from scanner_service.sessions.pass_planning import wanted_of
 from scanner_service.sessions.plan_in_force import PlanInForce
-from scanner_service.sessions.reckoning import brought_by
+from scanner_service.sessions.reckoning import Brought, brought_by
 from scanner_service.sessions.results import Results
 from scanner_service.sessions.rig_setups import RigSetup, is_driven, start_pass
 from scanner_service.sessions.session import LiveSession
@@ -49,6 +49,7 @@ class PassDesk:
         self._lock = threading.RLock()  # held for moments only: whoever asks is answered at once
         self._plans = PlanInForce(session, rigs, self._lock, lambda: (self._orders.all(), self._standing))
         self._setting_off: int | None = None  # the order whose pass is just being started: one at a time
+        self._withdrawing = 0  # how many withdrawals are under way: no pass is set off meanwhile
         self._tasks = 0  # passes and loops under way
         self._orders = OrderBook()
         self._standing: Pose | None = None
@@ -114,29 +115,24 @@ class PassDesk:
     def withdraw(self, order_id: int) -> PassOrder:
         """Take what a pass has scanned out of the map, not of the record; raises PassUnknown, SessionBusy."""
         with self._lock:
-            keys, other = self._orders.to_withdraw(order_id), self._under_way()
-            if other is not None:  # what it brings is told by the surface that was known before it
-                raise SessionBusy(f"pass order {other} is being carried out: withdraw another one when that is over")
-        for key in keys:
-            self.withdraw_pass(key)
+            keys = self._orders.to_withdraw(order_id)
+        self._take_out(keys)
         return self.order(order_id)
 
     def withdraw_pass(self, key: PassKey) -> int:
-        """Take any pass of the session out of the map; returns how many points that were, 0 when it is not there."""
-        points = self._session.withdraw_pass(key)
-        with self._lock:
-            self._orders.withdrawn(key)
-            self._decided()
-        return points
+        """Take any pass of the session out of the map; returns how many points that were, 0 when it is not there.
+
+        Raises SessionBusy.
+        """
+        return self._take_out([key])
 
     def keep(self, order_id: int) -> PassOrder:
         """Count what a doubted pass has brought after all; raises PassUnknown, SessionBusy."""
         with self._lock:
             order = self._orders.get(order_id)
             order.keep()
-            self._learn(order)
-            self._decided()
-        self._session.event(KEPT, {"order": order_id})
+            self._decided()  # where the sensor stands is not asked: other passes may have moved it since
+            self._session.event(KEPT, {"order": order_id})
         return order
 
     def carry_out(self, order_id: int, part_is_turned: bool = False) -> PassOrder:
@@ -243,6 +239,25 @@ class PassDesk:
 
     # -- inside -------------------------------------------------------------------------------------------------
 
+    def _take_out(self, keys: list[PassKey]) -> int:
+        """Withdraw passes, while none is set off: what one brings is told by the surface that was known before it."""
+        with self._lock:
+            other = self._under_way()
+            if other is not None:
+                raise SessionBusy(f"pass order {other} is being carried out: withdraw a pass when that is over")
+            self._withdrawing += 1
+        try:
+            points = 0
+            for key in keys:
+                points += self._session.withdraw_pass(key)
+                with self._lock:
+                    self._orders.withdrawn(key)
+                    self._decided()
+            return points
+        finally:
+            with self._lock:
+                self._withdrawing -= 1
+
     def _task(self, more: int) -> None:
         """One pass or loop more, or less, is under way."""
         with self._lock:
@@ -269,6 +284,8 @@ class PassDesk:
                 raise PartNotTurned(
                     f'first {turn}; then carry pass order {order_id} out with {{"part_is_turned": true}}: it waits on'
                 )
+            if self._withdrawing:
+                raise SessionBusy(f"a pass is being withdrawn: carry pass order {order_id} out when that is over")
             other = self._under_way()
             if other is not None:
                 why = (
@@ -302,7 +319,7 @@ class PassDesk:
                     return
                 order.status, order.message = PassStatus.FAILED, str(error)
                 self._learn(order)
-            self._session.event(OUTCOME, outcome_event(order))
+                self._session.event(OUTCOME, outcome_event(order))
         finally:
             self._task(-1)
             order.done.set()
@@ -333,23 +350,25 @@ class PassDesk:
 
     def _follow(self, order: PassOrder, before: Results, setup: RigSetup) -> None:
         """The thread of one pass: wait for its end, then say what it brought."""
+        brought: Brought | None = None
         try:
             self._session.wait_until_over()
             after = self._session.fresh_results()
             brought = brought_by(order.planned, before, after, setup, self._session.engine)
             has_failed = self._session.state == "failed"
             failure = (self._session.status().message or "the scan failed") if has_failed else None
-            with self._lock:
-                order.end(brought, failure)
-                self._learn(order)
-                self._session.doubted = self._orders.doubt()
         except Exception as error:  # noqa: BLE001 - the thread's end: whoever waits for the order must be told
             _LOG.exception("pass order %d of session %s", order.order_id, self._session.row.session_id)
-            with self._lock:
-                order.message, order.status = str(error), PassStatus.FAILED
-                self._learn(order)
+            failure = str(error)
         try:
-            self._session.event(OUTCOME, outcome_event(order))
+            with self._lock:  # the record has what becomes of an order as it comes
+                if brought is None:
+                    order.message, order.status = failure, PassStatus.FAILED
+                else:
+                    self._orders.ended(order, brought, failure)
+                self._learn(order)
+                self._decided()
+                self._session.event(OUTCOME, outcome_event(order))
         finally:
             self._task(-1)
             order.done.set()

@@ -49,9 +49,8 @@ class PassOrder:
     """A pass that was accepted: which one, how far it has come, and what became of it.
 
     `map_passes` are the numbers that its scanlines have in the map, once it is done, and `passes` the names of these
-    passes; `reached_end` is True when they go
-    through to the end of the pass, None when the record is of a time when this was not kept. `done` is set when a pass
-    that was carried out is over and its outcome told.
+    passes; `reached_end` is True when they go through to the end of the pass, None when the record is of a time when
+    this was not kept. `done` is set when a pass that was carried out is over and its outcome told.
     """
 
     order_id: int
@@ -172,8 +171,16 @@ class OrderBook:
         """A pass was taken out of the map: an order that has none left there is withdrawn."""
         self._gone.add(key)
         for order in self._orders:
-            if order.passes and self._gone.issuperset(order.passes):
-                order.status = PassStatus.WITHDRAWN
+            self._leave(order)
+
+    def ended(self, order: PassOrder, brought: Brought, failure: str | None) -> None:
+        """As `PassOrder.end`; it is withdrawn at once when its passes were taken out before it was reckoned up."""
+        order.end(brought, failure)
+        self._leave(order)
+
+    def _leave(self, order: PassOrder) -> None:
+        if order.passes and self._gone.issuperset(order.passes):
+            order.status = PassStatus.WITHDRAWN
 
     def doubt(self) -> str | None:
         """What is to be decided of the first order that is doubted; None when none is."""
@@ -182,12 +189,15 @@ class OrderBook:
     def restore(self, events: Iterable[EventRow]) -> None:
         """Go on where the events of an earlier service end; what it was just carrying out has failed.
 
-        An event that cannot be read ends it: orders are numbered, and none may take another's number.
+        An event that cannot be read ends it: orders are numbered, and none may take another's number. A decision that
+        does not fit its order is passed over.
         """
         for event in events:
             try:
                 self._replay(event.kind, event.details)
-            except (KeyError, TypeError, ValueError, PassUnknown, SessionBusy) as error:
+            except SessionBusy as error:
+                _LOG.warning("a decision on a pass order is passed over: %s", error)
+            except (KeyError, TypeError, ValueError, PassUnknown) as error:
                 _LOG.warning("the pass orders of a session cannot be read beyond event %s: %s", event.kind, error)
                 break
         for order in self._orders:
@@ -217,6 +227,7 @@ class OrderBook:
                     order.outcome = Outcome.from_dict(details["outcome"])
                 order.passes = [key_of(named) for named in details.get("passes", ())]
                 order.doubt_it()
+                self._leave(order)
 
 
 def accepted_event(order: PassOrder) -> dict[str, Any]:

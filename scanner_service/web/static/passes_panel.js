@@ -167,9 +167,9 @@ export class PassesPanel {
   }
 
   #draw(orders, loop) {
-    const focused = document.activeElement?.closest("#orders [data-order]")?.dataset.order;
+    const had = document.activeElement?.closest("#orders button")?.dataset;
     byId("orders").replaceChildren(...orders.toReversed().map((order) => this.#order(order)));
-    if (focused) byId("orders").querySelector(`[data-order="${focused}"] button`)?.focus();
+    if (had) sameButton(byId("orders").querySelectorAll("button"), had)?.focus();
     this.onOrder(orders.findLast(({ status }) => status === "running") ?? orders.findLast(({ status }) => status === "accepted") ?? null);
     byId("end-loop").hidden = !loop?.running;
     byId("run-loop").hidden = Boolean(loop?.running);
@@ -195,7 +195,8 @@ export class PassesPanel {
     if (!["done", "failed", "doubted"].includes(status) || !passes.length || this.#isUnderWay) return null;
     const said = { says: "Withdraw", asks: "Press again: its points leave the map", does: "Withdrawing…", title: "Take what this pass has scanned out of the map, such as when the part was not turned" };
     const withdraw = pressedTwice(said, () => this.#act(() => withdrawOrder(this.#id, number).then(this.scanned)));
-    const keep = element("button.quiet", { type: "button", title: "The part lies as the pass asks: count what it has brought", onclick: () => this.#act(() => keepOrder(this.#id, number)) }, "Keep");
+    const keep = element("button.quiet", { type: "button", "data-order": number, "data-action": "keep", title: "The part lies as the pass asks: count what it has brought", onclick: () => this.#act(() => keepOrder(this.#id, number)) }, "Keep");
+    Object.assign(withdraw.dataset, { order: number, action: "withdraw" });
     return element("span.row", {}, withdraw, status === "doubted" ? keep : null);
   }
 
@@ -217,10 +218,15 @@ export class PassesPanel {
         ? element(
             "span.row",
             {},
-            element("button", { type: "button", onclick: go }, pass.turn_part ? "The part is turned: carry out" : "Carry out (laser on)"),
-            element("button.quiet", { type: "button", onclick: () => this.#act(() => cancelOrder(this.#id, number)) }, "Cancel"),
+            element("button", { type: "button", "data-order": number, "data-action": "carry-out", onclick: go }, pass.turn_part ? "The part is turned: carry out" : "Carry out (laser on)"),
+            element("button.quiet", { type: "button", "data-order": number, "data-action": "cancel", onclick: () => this.#act(() => cancelOrder(this.#id, number)) }, "Cancel"),
           )
         : null,
     );
   }
+}
+
+// Of buttons that were drawn anew, the one that did the same for the same order; none when it is gone: another does something else.
+export function sameButton(buttons, { order, action }) {
+  return [...buttons].find(({ dataset }) => dataset.action === action && dataset.order === order) ?? null;
 }

@@ -33,3 +33,10 @@ def test_a_region_of_interest_without_a_point_is_remarked_once_the_pass_is_over(
     assert "no point" in said and "x -4.0 to 3.8" in said
     assert remarks_on(aside, snapshot_of(plate, unsettled=lambda points: points[:, 1] > 13.0)) == ()  # it goes on yet
     assert remarks_on(Requirement(interest=Interest((3.0, 0.0, -1.0), (110.0, 10.0, 1.0))), snapshot_of(plate)) == ()
+
+
+def test_densities_below_one_are_told_as_what_they_are() -> None:
+    coarse = straight_down(lambda x, y: 0.0 * x, np.arange(-40, 40, 2.5), np.arange(0, 40, 1.0), 1.0)
+    wanted = Requirement(density_per_mm2=0.6, finest_line_spacing_mm=1.0)
+    (said,) = remarks_on(wanted, snapshot_of(coarse))
+    assert "a density of 0.6 points/mm² is more" in said and "are 0.4 points/mm²" in said

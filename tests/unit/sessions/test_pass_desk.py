@@ -94,6 +94,13 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned, monke
         learn(order)
 
     monkeypatch.setattr(desk, "_learn", planned_before)
+    event, held = session.event, {}
+
+    def owned(kind, details):
+        held[kind] = desk._lock._is_owned()
+        event(kind, details)
+
+    monkeypatch.setattr(session, "event", owned)
     order = desk.accept(plan.passes[0].number)
     assert order.status is PassStatus.ACCEPTED
     desk.carry_out(order.order_id)
@@ -105,6 +112,7 @@ def test_a_pass_is_accepted_scanned_by_hand_and_reckoned_up(book, scanned, monke
     session.stop()
     desk.wait_for(order)
     assert order.status is PassStatus.DONE
+    assert held["pass_outcome"]  # no decision comes between what is and what the record tells
     assert order.reached_end and order.teaches
     assert order.outcome.promised_mm2 == pytest.approx(one.promised.mm2)
     assert order.outcome.expected_mm2 == pytest.approx(one.explores.mm2)
@@ -401,9 +409,22 @@ def test_one_pass_is_carried_out_at_a_time(book, scanned):
         desk.carry_out(second.order_id)
     assert (first.status, second.status, session.state) == (PassStatus.RUNNING, PassStatus.CANCELLED, "stopped")
     assert not first.done.is_set()
+    with pytest.raises(SessionBusy, match="pass order 1 is being carried out: withdraw"):
+        desk.withdraw_pass(("any", 1, 0))
     may_judge.set()
     desk.wait_for(first)
     assert first.done.is_set() and first.status is PassStatus.DONE
+    third, take_out, refused = desk.accept(1), session.withdraw_pass, []
+
+    def meanwhile(key):
+        with pytest.raises(SessionBusy, match="a pass is being withdrawn") as caught:
+            desk.carry_out(third.order_id)
+        refused.append(caught.value)
+        return take_out(key)
+
+    session.withdraw_pass = meanwhile
+    desk.withdraw(first.order_id)
+    assert refused and third.status is PassStatus.ACCEPTED
     desk.carry_out(desk.accept(1).order_id)
     session.stop()
 

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 const { inWords, presetOf, reached, refusalsByField, requestOf, textsOf } = await import("../../../scanner_service/web/static/requirement_form.js");
-const { fate, foretold, loopSaid, outOfReach, planning, served } = await import("../../../scanner_service/web/static/passes_panel.js");
+const { fate, foretold, loopSaid, outOfReach, planning, sameButton, served } = await import("../../../scanner_service/web/static/passes_panel.js");
 const { opening } = await import("../../../scanner_service/web/static/numbers.js");
 
 const STANDARD = { preset: "standard", density_per_mm2: null, density_share: 0.5, line_spacing_mm: null, chord_error_mm: null, finest_line_spacing_mm: 0.05, incidence_deg: null, noise_mm: null, coverage_share: 0.95, interest: null };
@@ -94,4 +94,11 @@ test("a loop says whether it scans or plans, and why it ended", () => {
   assert.equal(loopSaid(loop, [{ status: "done" }, { status: "running" }]), "Closed loop: pass 3 of at most 20");
   assert.equal(loopSaid(loop, [{ status: "done" }]), "Closed loop: planning, 3 of at most 20 passes done");
   assert.equal(loopSaid({ ...loop, running: false, why_ended: "nothing is left" }, []), "The loop ended: nothing is left.");
+});
+
+test("the focus stays on what it was on, and never comes to the laser by itself", () => {
+  const button = (order, action) => ({ dataset: { order, action } });
+  const drawn = [button("2", "carry-out"), button("2", "cancel"), button("1", "carry-out"), button("1", "cancel")];
+  assert.equal(sameButton(drawn, { order: "1", action: "cancel" }), drawn[3]);
+  assert.equal(sameButton(drawn.slice(0, 3), { order: "1", action: "cancel" }), null);
 });
