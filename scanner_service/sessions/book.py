@@ -176,14 +176,16 @@ class SessionBook:
                 self._places -= 1
 
     def _hold(self, session: LiveSession) -> None:
-        """Hold a session open from now on; raises SessionBusy, and closes it, when all are being closed."""
-        desk = PassDesk(session, self._rigs)  # from it the session knows what is to be decided of its passes
-        with self._lock:
-            if not self._is_closed:
+        """Hold a session open from now on, or close it: raises SessionBusy when all are being closed."""
+        try:
+            desk = PassDesk(session, self._rigs)  # from it the session knows what is to be decided of its passes
+            with self._lock:
+                if self._is_closed:
+                    raise SessionBusy("the service is being closed")
                 self._live[session.row.session_id], self._desks[session.row.session_id] = session, (session, desk)
-                return
-        session.close()
-        raise SessionBusy("the service is being closed")
+        except BaseException:
+            session.close()
+            raise
 
     def _open(self, spec: SourceSpec) -> Source:
         """Open a source; when a port is held by a session of this book, say by which."""
@@ -272,10 +274,8 @@ class SessionBook:
 
     def pass_desk(self, session: LiveSession) -> PassDesk:
         """The desk where the passes of a session that is held open are ordered."""
-        known = self._desks.get(session.row.session_id)
-        if known is not None and known[0] is session:
-            return known[1]
-        return PassDesk(session, self._rigs)  # it was just let go of, and refuses all
+        held, desk = self._desks.get(session.row.session_id, (None, None))
+        return desk if desk is not None and held is session else PassDesk(session, self._rigs)  # it was just let go of
 
     def live(self, session_id: str) -> LiveSession | None:
         """The session if it is held open."""

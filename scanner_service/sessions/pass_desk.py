@@ -168,8 +168,8 @@ class PassDesk:
 
     def run_loop(self, limits: LoopLimits) -> LoopState:
         """Plan and carry out by itself until nothing is left to do; raises SessionBusy while a loop runs."""
-        if self._session.doubted is not None:  # a plan would be of surface that is not there
-            raise SessionBusy(self._session.doubted)
+        if (doubt := self._orders.doubt()) is not None:  # a plan would be of surface that is not there
+            raise SessionBusy(doubt)
         self.plan(limits.serving)  # what cannot be planned is refused now, not in the loop
         by_client = isinstance(self._session.source, PushSource) and self._plans.rig().driven_by_client
         with self._lock:

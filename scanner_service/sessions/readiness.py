@@ -55,10 +55,10 @@ class _Course:
 class _Compilations(event.Listener):
     """Hears of each kernel that is compiled; of those that are loaded nothing is said."""
 
-    def on_start(self, event: Any) -> None:
+    def on_start(self, _event: Any) -> None:
         _COURSE.compiles = True
 
-    def on_end(self, event: Any) -> None:
+    def on_end(self, _event: Any) -> None:
         pass
 
 

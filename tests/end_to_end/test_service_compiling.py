@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 
 import httpx
 import pytest
@@ -45,5 +46,7 @@ def test_whoever_wants_a_session_before_all_is_compiled_is_told_when_to_come_aga
     told = ready.json()["preparing"]
     assert told["what"] == STEPS[told["step"] - 1] and told["of"] == len(STEPS) and told["seconds"] >= 0.0
     while not told["compiles"]:  # nothing is in the cache: the first kernel says so
+        time.sleep(0.1)
         told = fresh.get("/readyz").json()["preparing"]
+        assert told is not None, "all is ready, and nothing was said to be compiled"
     assert fresh.get("/api/v1/sessions").json()["sessions"] == []  # none was made, and the list does not wait
