@@ -95,16 +95,16 @@ def test_a_turntable_is_looped_until_the_coverage_is_reached_that_was_asked_for(
     session_id, before = coarse_scan(service, 16.0, 0.8, 0.6)
     assert before["coverage"] < 0.2
     where = f"/api/v1/sessions/{session_id}"
-    limits = {"max_passes": 12, "coverage_share": 0.8}
+    limits = {"max_passes": 12, "coverage_share": 0.7}
     assert service.client.post(f"{where}/rescan", json=limits).status_code == 202
     wait_for(lambda: not service.client.get(f"{where}/rescan").json()["loop"]["running"], "the loop to end", 3500.0)
     loop = loop_that_ended(service, where)
-    assert loop["why_ended"] == "the observed coverage of 80.0% is reached" and loop["passes"] > 1
+    assert loop["why_ended"] == "the observed coverage of 70.0% is reached" and loop["passes"] > 1
     result = service.client.get(f"{where}/pass-orders").json()
     assert_driven_by_parts_of_a_turn(result)
     large = [order["outcome"] for order in result["orders"] if order["outcome"]["promised_mm2"] > 100.0]
     assert large and all(outcome["reached_mm2"] > 0.7 * outcome["promised_mm2"] for outcome in large)
-    assert service.status(session_id)["coverage"] >= 0.8
+    assert service.status(session_id)["coverage"] >= 0.7
 
 
 @pytest.mark.long
