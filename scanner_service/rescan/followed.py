@@ -102,9 +102,9 @@ class RegionBook:
         for known_id, old in self._known.items():
             if known_id in kept:
                 continue
-            is_withdrawn = not old.found_by <= surface.passes
-            is_there = is_withdrawn or surface.is_there(old.cubes, old.region)
-            if not surface.is_settled(old.cubes) or not is_there:
+            is_there = surface.is_there(old.cubes, old.region)
+            is_withdrawn = not (old.found_by if is_there else old.passes) <= surface.passes
+            if not surface.is_settled(old.cubes) or not (is_there or is_withdrawn):
                 kept[known_id] = old  # it waits for points to settle
                 continue
             merged = [other for other, cubes in zip(ids, fresh, strict=True) if other and len(cubes & old.cubes)]
@@ -215,7 +215,9 @@ class RegionBook:
     ) -> _Known:
         """`on_it` are the passes with points on it now, `gone` those of the ones before that were withdrawn."""
         status, why = old.region.status, ""
-        later = (old.later - gone) | (on_it - old.passes)
+        passes, later = on_it | (old.passes - gone), (old.later - gone) | (on_it - old.passes)
+        if status is RegionStatus.RESOLVED or not passes - later:  # it is found anew, by those that are on it now
+            passes, later = on_it, frozenset()
         if status is RegionStatus.RESOLVED:
             status, why = RegionStatus.OPEN, "fails again"
         elif on_it - old.passes:
@@ -227,7 +229,7 @@ class RegionBook:
         known = _Known(
             replace(region, number=known_id, region_id=known_id, status=old.region.status, history=old.region.history),
             cubes,
-            on_it | (old.passes - gone),
+            passes,
             later,
         )
         return _stepped(known_id, known, status, why, self._version, changes) if why else known

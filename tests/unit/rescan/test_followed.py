@@ -85,6 +85,24 @@ def test_a_region_goes_with_the_pass_that_found_it_and_is_open_again_without_the
     assert left.history[-1].why == "the pass that was over it was withdrawn"
 
 
+def test_passes_that_were_withdrawn_one_after_another_leave_no_region_behind() -> None:
+    """Three passes that believe themselves 40 mm aside, each withdrawn; the third also shows what the first pass sees."""
+    cliff, book, version = triangulated(_raised_cliff, X, Y, 0.3), RegionBook(), 1
+    _followed(book, cliff, version)
+    (true,) = book.current
+    for number, aside_mm in ((2, 40.0), (3, 40.0), (4, 2.0)):
+        elsewhere = triangulated(_raised_cliff, X, Y, 0.3, pass_number=number)
+        for name in ("points", "laser"):
+            moved = [values + np.array([aside_mm, 0.0, 0.0]) for values in getattr(elsewhere, name)]
+            setattr(elsewhere, name, moved)
+        _followed(book, cliff.joined(elsewhere), version + 1)
+        assert len(book.current) > 1 or aside_mm < 10.0
+        _followed(book, cliff, version + 2)
+        assert [region.region_id for region in book.current] == [true.region_id], number
+        assert book.current[0].area_mm2 == true.area_mm2
+        version += 2
+
+
 def test_a_region_whose_points_wait_is_not_called_resolved() -> None:
     book, scan = RegionBook(), straight_down(_ramps, X, Y, 0.3)
     _followed(book, scan, 1)
