@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.scanline import Float64Array, read_only
+from drivers.scanline import BoolArray, Float64Array, read_only
 from scanner_service.analysis.snapshot import LineTable, MapSnapshot
 from scanner_service.rescan.excerpt import rows_of_lines
 from scanner_service.rescan.stations import IntArray, Stations
@@ -31,7 +31,8 @@ class Frames:
     that depth is measured along, away from the sensor, `pitch_rad` (p,) the angle between neighbouring rays (NaN: no
     two of them returned), `distance_mm` (p,) the usual one from laser to surface. `lines` (p,) says of how many lines
     that is. Of passes that go round, `turn` (p, 3) is the unit axis, else NaN; `along` and `axis` are then those of the
-    line whose plane has the normal `plane` (p, 3).
+    line whose plane has the normal `plane` (p, 3). `in_force` (p,) is False for passes no point of which counts: a
+    withdrawn one is as if it had never been.
     """
 
     along: Float64Array
@@ -41,6 +42,7 @@ class Frames:
     lines: IntArray
     turn: Float64Array
     plane: Float64Array
+    in_force: BoolArray
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
@@ -48,6 +50,11 @@ class Frames:
 
     def __len__(self) -> int:
         return len(self.along)
+
+    @property
+    def several(self) -> bool:
+        """Whether more than one pass is in force."""
+        return int(self.in_force.sum()) > 1
 
     def of_lines(self, lines: LineTable, rows: IntArray, group: IntArray) -> tuple[Float64Array, Float64Array]:
         """(k, 3) directions of some lines (rows (k,), passes `group` (k,)), and (k, 3) those of their depth."""
@@ -107,7 +114,9 @@ def frames_of(
         step = np.abs(np.diff(angle))[next_to]
         pitch[number] = np.median(step) if len(step) else np.nan
         distance[number] = np.median(np.linalg.norm(ray, axis=1))
-    return Frames(along, axis, pitch, distance, used, turn, plane)
+    counted = stations.group[snapshot.line[snapshot.neighbours > 0]]
+    in_force = np.bincount(counted, minlength=passes) > 0
+    return Frames(along, axis, pitch, distance, used, turn, plane, in_force)
 
 
 def angle_and_depth(ray_mm: Float64Array, along: Float64Array, axis: Float64Array) -> tuple[Float64Array, Float64Array]:

@@ -146,7 +146,7 @@ def judge(
     failing = ((too_wide & ~enough[:, None]) | beyond | beyond_rule) & judged[:, None]
     allowed = np.fmin(allowed, by_rule)
     filled = np.zeros_like(failing)
-    if len(frames) > 1:
+    if frames.several:
         filled = _filled(snapshot, strips, failing, np.fmin(allowed, strips.reach_mm))
     failing &= ~filled
     width = np.where(filled, np.fmin(width, delta), width)  # what lies further out is the other pass's surface
@@ -200,9 +200,9 @@ def asked_of_the_first_pass(lines: LineTable, stations: Stations, frames: Frames
 
     It bounds what is asked of later passes: a finer pass must be able to mend.
     """
-    if len(frames) < 2:
+    if not frames.several:
         return float("inf")
-    number = int(stations.group[0])
+    number = int(stations.group[np.argmax(frames.in_force[stations.group])])
     first = np.flatnonzero(stations.group == number)[: frames.lines[number]]
     asked = requirement.per_mm2(lines.line_spacing_mm[first], stations.point_spacing_mm[first])
     known = asked[np.isfinite(asked)]

@@ -135,7 +135,7 @@ class PointVerdicts:
             turned = (frames.lines != old)[stations.group]
             if not (stations.group[: len(known.group)] == known.group).all():
                 turned[:] = True
-            if (len(frames) > 1) != (len(self._frames) > 1) or asked != self._asked:
+            if frames.several != self._frames.several or asked != self._asked:
                 touched[:] = True
         touched |= turned
         touched[snapshot.line[changed]] = True
@@ -222,7 +222,7 @@ class PointVerdicts:
         strips = Strips(**self._columns.views("strips", slice(len(snapshot))))
         gaps = gaps_between(snapshot, stations, frames, fan, firsts, seconds, kinds, downs)
         gaps = settled_kinds(snapshot, strips, gaps)
-        if len(frames) > 1:
+        if frames.several:
             gaps = self._left(snapshot, stations, frames, strips, gaps, seconds, changed)
         if self._requirement.interest is None:
             return gaps
@@ -289,7 +289,7 @@ class PointVerdicts:
 
     def _looks_around(self, frames: Frames) -> bool:
         """Whether verdicts hang on points of lines that are neither adjacent nor under the same rays."""
-        return len(frames) > 1 or self._requirement.chord_error_mm is not None
+        return frames.several or self._requirement.chord_error_mm is not None
 
     def _sight_mm(self, snapshot: MapSnapshot, stations: Stations) -> Float64Array:
         """(L,) how far from the points of a line a point may be that its verdict hangs on."""

@@ -86,7 +86,7 @@ def test_a_region_goes_with_the_pass_that_found_it_and_is_open_again_without_the
 
 
 def test_passes_that_were_withdrawn_one_after_another_leave_no_region_behind() -> None:
-    """Three passes that believe themselves 40 mm aside, each withdrawn; the third also shows what the first pass sees."""
+    """Two passes that believe themselves 40 mm aside, and one 2 mm, each withdrawn before the next."""
     cliff, book, version = triangulated(_raised_cliff, X, Y, 0.3), RegionBook(), 1
     _followed(book, cliff, version)
     (true,) = book.current
